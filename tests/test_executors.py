@@ -161,7 +161,18 @@ def test_a_cluster_that_takes_a_worker_away_and_brings_others_gives_the_bits_of_
 
 @pytest.mark.slow
 def test_a_killed_worker_ends_the_command_and_the_next_one_goes_on(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "figures.command_line", "maps", "--albedo", "0.9", "--grid", "4,16,6,4", "--paths", "3e5"]
+    command = [
+        sys.executable,
+        "-m",
+        "figures.command_line",
+        "maps",
+        "--albedo",
+        "0.9",
+        "--grid",
+        "4,16,6,4",
+        "--paths",
+        "3e5",
+    ]
     run = [*command, "--workers", "2", "--out", str(tmp_path)]
     process = subprocess.Popen(run, stderr=subprocess.PIPE, text=True)
     workers: list[psutil.Process] = []

@@ -108,7 +108,18 @@ def test_many_queries_are_answered_block_by_block_in_flat_memory() -> None:
     assert max(used) < 1.1 * used[1]
 
 
-MAPS = [sys.executable, "-m", "figures.command_line", "maps", "--albedo", "0.95", "--grid", "64,16,6,4", "--paths", "3e6"]
+MAPS = [
+    sys.executable,
+    "-m",
+    "figures.command_line",
+    "maps",
+    "--albedo",
+    "0.95",
+    "--grid",
+    "64,16,6,4",
+    "--paths",
+    "3e6",
+]
 KILLS, EVERY = 12, 5.0  # seconds
 
 

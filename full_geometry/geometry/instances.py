@@ -93,8 +93,8 @@ def shapes_of(scene: mi.Scene, groups: Sequence[Group]) -> list[mi.Shape]:
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
-    """Shapes at their places in a scene.
+class InstanceTable:
+    """Numbers of shapes and of their instances in a scene, by which tables of kernels are looked up.
 
     Args:
         shapes: each once.
@@ -107,7 +107,7 @@ class Placed:
     first: np.ndarray
 
     @classmethod
-    def of(cls, shapes: list[mi.Shape], shown: Sequence[Group]) -> Placed:
+    def of(cls, shapes: list[mi.Shape], shown: Sequence[Group]) -> InstanceTable:
         """Shapes of a scene that shows these groups."""
         groups = [next((g for g in shown if any(s is shape for s in g.shapes)), None) for shape in shapes]
         first = np.cumsum([0, *(1 if g is None else len(g.instances) for g in groups)])
@@ -185,8 +185,8 @@ def ends_of(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return points.min(axis=2), points.max(axis=2)
 
 
-class Pose(NamedTuple):
-    """Where the instance stands that each lane has met; the world itself where it has met none.
+class InstanceTransform(NamedTuple):
+    """The transformation M of the instance that each lane has met; the identity where it has met none.
 
         p = M p',    n = M^-T n' / |M^-T n'|,    dp = M dp',    dn = (1 - n n^T) M^-T dn' / |M^-T n'|.
 
@@ -199,26 +199,28 @@ class Pose(NamedTuple):
     to_object: list[mi.Vector3f]
     rounding: mi.Float
 
-    def point_into(self, p: mi.Point3f) -> mi.Point3f:
+    def point_to_object(self, p: mi.Point3f) -> mi.Point3f:
         """A point in the frame of the group."""
         return mi.Point3f(_map(self.to_object, p) + self.to_object[3])
 
-    def normal_into(self, n: mi.Normal3f) -> mi.Normal3f:
+    def normal_to_object(self, n: mi.Normal3f) -> mi.Normal3f:
         """A normal in the frame of the group."""
         return dr.normalize(_transposed(self.to_world, n))
 
-    def ray_into(self, ray: mi.Ray3f) -> mi.Ray3f:
+    def ray_to_object(self, ray: mi.Ray3f) -> mi.Ray3f:
         """A ray in the frame of the group, at the same distances."""
         local = mi.Ray3f(ray)
-        local.o, local.d = self.point_into(ray.o), mi.Vector3f(_map(self.to_object, ray.d))
+        local.o, local.d = self.point_to_object(ray.o), mi.Vector3f(_map(self.to_object, ray.d))
         return local
 
-    def into(self, at: Any) -> Any:
+    def surface_point_to_object(self, at: Any) -> Any:
         """A `points.SurfacePoint` in the frame of the group."""
         w = mi.Vector3f(dr.normalize(_map(self.to_object, at.w)))
-        return at._replace(p=self.point_into(at.p), n=self.normal_into(at.n), n_out=self.normal_into(at.n_out), w=w)
+        return at._replace(
+            p=self.point_to_object(at.p), n=self.normal_to_object(at.n), n_out=self.normal_to_object(at.n_out), w=w
+        )
 
-    def entry(self, entry: Any) -> Any:
+    def entry_to_world(self, entry: Any) -> Any:
         """A `points.EntrySample` of the frame of the group in the scene: dA = |det M| |M^-T n'| dA'."""
         n, n_out = (_transposed(self.to_object, each) for each in (entry.n, entry.n_out))
         x, y, z, shift = self.to_world
@@ -228,8 +230,8 @@ class Pose(NamedTuple):
             weight=entry.weight * area,
         )  # fmt: skip
 
-    def shown(self, si: mi.SurfaceInteraction3f, flags: int) -> mi.SurfaceInteraction3f:
-        """What a ray has met in the frame of the group, in the scene; without what `shape.completed` adds."""
+    def interaction_to_world(self, si: mi.SurfaceInteraction3f, flags: int) -> mi.SurfaceInteraction3f:
+        """An interaction of the frame of the group in the scene; `shape.completed` adds the rest."""
         M, inverse = self.to_world, self.to_object
         si.p = mi.Point3f(_map(M, si.p) + M[3])
         si.n, si.dp_du, si.dp_dv = dr.normalize(_transposed(inverse, si.n)), _map(M, si.dp_du), _map(M, si.dp_dv)
@@ -245,11 +247,11 @@ class Pose(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
-    """What rays meet in a scene, and in scenes of some of its shapes.
+class InstanceScene:
+    """Intersects rays with a scene, or a scene of some of its shapes, whose instances are data of kernels.
 
     Mitsuba has a function for every instance in each kernel, which takes 30 ms to compile and, at 1000 of them, 10 s to
-    record again. Here there is one for every shape, and instances are data, see `Pose`.
+    record again. Here there is one for every shape, and instances are data, see `InstanceTransform`.
 
     Args:
         shapes: that rays may meet, where there are instances.
@@ -266,7 +268,7 @@ class Sight:
     lamps: mi.Float | None = None
 
     @classmethod
-    def of(cls, scene: mi.Scene, shown: Sequence[Group]) -> Sight:
+    def of(cls, scene: mi.Scene, shown: Sequence[Group]) -> InstanceScene:
         """Of a scene that shows these groups."""
         known, lamps = bounds_of(scene.shapes(), shown), lamps_of(scene)
         if not shown:
@@ -274,7 +276,7 @@ class Sight:
         return replace(cls.of_shapes(shapes_of(scene, shown), shown), bounds=known, lamps=lamps)
 
     @classmethod
-    def of_shapes(cls, shapes: list[mi.Shape], shown: Sequence[Group] = ()) -> Sight:
+    def of_shapes(cls, shapes: list[mi.Shape], shown: Sequence[Group] = ()) -> InstanceScene:
         """Of shapes, those of groups last."""
         instances = [mi.ShapePtr(each) for group in shown for each in group.instances]
         M = np.concatenate([np.eye(4)[None], *(group.to_world for group in shown)])
@@ -330,8 +332,8 @@ class Sight:
             return hit.compute_surface_interaction(ray, flags, active)
         active = active & hit.is_valid()
         row = looked_up(self.tables["row"], hit.instance, 0, active)
-        pose = self._pose(row, active)
-        local = pose.ray_into(ray)
+        transform = self._transform(row, active)
+        local = transform.ray_to_object(ray)
         # on a CPU a hit knows the number of a shape in its group instead of the shape
         in_group = dr.gather(mi.Int32, self.tables["first"], row, active) + mi.Int32(hit.shape_index)
         own = looked_up(self.tables["kind"], hit.shape, 0, active)
@@ -340,15 +342,15 @@ class Sight:
         si = dr.switch(mi.UInt32(kind), calls, hit, local, active) if len(calls) > 1 else calls[0](hit, local, active)
         si.shape = dr.reinterpret_array(mi.ShapePtr, dr.gather(mi.UInt32, self.tables["pointer"], kind, active))
         si.instance = hit.instance
-        return completed(pose.shown(si, flags), hit, ray, flags, active)
+        return completed(transform.interaction_to_world(si, flags), hit, ray, flags, active)
 
-    def pose(self, si: mi.SurfaceInteraction3f, active: mi.Bool | bool = True) -> Pose:
-        """Where the instance stands that a ray has met."""
-        return self._pose(looked_up(self.tables["row"], si.instance, 0, active), active)
+    def transform(self, si: mi.SurfaceInteraction3f, active: mi.Bool | bool = True) -> InstanceTransform:
+        """The transformation of the instance that a ray has met."""
+        return self._transform(looked_up(self.tables["row"], si.instance, 0, active), active)
 
-    def _pose(self, row: mi.Int32, active: mi.Bool | bool) -> Pose:
+    def _transform(self, row: mi.Int32, active: mi.Bool | bool) -> InstanceTransform:
         M, inverse = (self._columns(key, row, active) for key in ("to_world", "to_object"))
-        return Pose(M, inverse, dr.gather(mi.Float, self.tables["rounding"], row, active))
+        return InstanceTransform(M, inverse, dr.gather(mi.Float, self.tables["rounding"], row, active))
 
     def _columns(self, key: str, row: mi.Int32, active: mi.Bool) -> list[mi.Vector3f]:
         return [dr.gather(mi.Vector3f, column, row, active) for column in self.tables[key]]
@@ -401,24 +403,26 @@ def _interaction(
 
 
 @dataclass(frozen=True, eq=False)
-class PlacedProposals:
-    """Entries drawn in the frame of the group, directions in the scene.
+class InstanceProposals:
+    """`Proposals` of a shape in a group: positions are drawn in the frame of the group, directions in the scene.
 
     Args:
         proposals: `points.Proposals` of the shape.
-        pose: of the instance.
+        transform: of the instance.
     """
 
     proposals: Any
-    pose: Pose
+    transform: InstanceTransform
 
     def prepare(self, out: Any, prepared: Any, active: mi.Bool) -> Any:
         """As of the proposals."""
-        return self.proposals.prepare(self.pose.into(out), prepared, active)
+        return self.proposals.prepare(self.transform.surface_point_to_object(out), prepared, active)
 
     def sample(self, out: Any, prim_index: mi.UInt32, prepared: Any, sampler: mi.Sampler, active: mi.Bool) -> Any:
         """As of the proposals."""
-        return self.pose.entry(self.proposals.sample(self.pose.into(out), prim_index, prepared, sampler, active))
+        return self.transform.entry_to_world(
+            self.proposals.sample(self.transform.surface_point_to_object(out), prim_index, prepared, sampler, active)
+        )
 
     def sample_direction(self, entry: Any, out: Any, u: mi.Point2f) -> tuple[Any, Any]:
         """As of the proposals, which ask for both ends alone."""
@@ -430,34 +434,34 @@ class PlacedProposals:
 
 
 @dataclass(frozen=True, eq=False)
-class PlacedTransport(TransportAround):
+class InstanceTransport(TransportAround):
     """S of a learnt object in the frame of the group, which an instance moves, turns or mirrors.
 
     Args:
-        pose: of the instance.
+        transform: of the instance.
     """
 
-    pose: Pose
+    transform: InstanceTransform
 
     @property
-    def alpha(self) -> PlacedAlbedo | None:
-        return None if self.transport.alpha is None else PlacedAlbedo(self.transport.alpha, self.pose)
+    def alpha(self) -> InstanceAlbedo | None:
+        return None if self.transport.alpha is None else InstanceAlbedo(self.transport.alpha, self.transform)
 
     def prepare(self, at: Any, active: mi.Bool = True) -> Any:
         """As of the transport."""
-        return self.transport.prepare(self.pose.into(at), active)
+        return self.transport.prepare(self.transform.surface_point_to_object(at), active)
 
     def S(self, exit: Any, at: Any, active: mi.Bool = True) -> mi.Spectrum:
         """As of the transport."""
-        return self.transport.S(exit, self.pose.into(at), active)
+        return self.transport.S(exit, self.transform.surface_point_to_object(at), active)
 
 
 @dataclass(frozen=True, eq=False)
-class PlacedAlbedo:
+class InstanceAlbedo:
     """`points.ObjectAlbedo` of a learnt object in the frame of the group."""
 
     alpha: Any
-    pose: Pose
+    transform: InstanceTransform
 
     @property
     def known(self) -> tuple[mi.Spectrum, mi.Spectrum]:
@@ -465,4 +469,4 @@ class PlacedAlbedo:
 
     def __call__(self, at: Any, active: mi.Bool) -> tuple[mi.Spectrum, mi.Spectrum]:
         """As of the shape."""
-        return self.alpha(self.pose.into(at), active)
+        return self.alpha(self.transform.surface_point_to_object(at), active)

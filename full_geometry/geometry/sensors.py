@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.geometry.instances import Sight
+from full_geometry.geometry.instances import InstanceScene
 from full_geometry.geometry.rounding import ray_from
 
 
@@ -57,7 +57,7 @@ def rays_by(sensor: mi.Sensor, sampler: mi.Sampler) -> tuple[mi.Ray3f, mi.Spectr
     return widened(ray, n), weight, mi.Vector2f(pixel) if film.rfilter().is_box_filter() else position
 
 
-def past_emitters(scene: mi.Scene, sight: Sight, ray: mi.Ray3f) -> mi.Ray3f:
+def past_emitters(scene: mi.Scene, instance_scene: InstanceScene, ray: mi.Ray3f) -> mi.Ray3f:
     """Rays of a camera that sees no emitters: those that meet one begin behind it."""
     if all(emitter.get_shape() is None for emitter in scene.emitters()):
         return ray
@@ -65,9 +65,9 @@ def past_emitters(scene: mi.Scene, sight: Sight, ray: mi.Ray3f) -> mi.Ray3f:
     def step(o: mi.Point3f, active: mi.Bool) -> tuple[mi.Point3f, mi.Bool]:
         here = mi.Ray3f(ray)
         here.o = o
-        si = sight.intersect(scene, here, mi.RayFlags.Minimal, active=active)
+        si = instance_scene.intersect(scene, here, mi.RayFlags.Minimal, active=active)
         active &= si.is_valid() & (si.emitter(scene, active) != None)  # noqa: E711
-        return dr.select(active, ray_from(si, ray.d, sight.rounding(si)).o, o), active
+        return dr.select(active, ray_from(si, ray.d, instance_scene.rounding(si)).o, o), active
 
     result, n = type(ray)(ray), dr.width(ray)
     state = mi.Point3f(ray.o) + dr.zeros(mi.Point3f, n), dr.full(mi.Bool, True, n)

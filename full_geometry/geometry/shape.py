@@ -188,8 +188,8 @@ class Geometry:
         state: `geometry_of` the shape as it was surveyed.
         contents: the `Contents` that lie inside, for a transport that takes them; None where nothing does.
         group: the `instances.Group` whose instances show the shape; None of a shape that stands in the scene itself.
-        pose: the `instances.Pose` of the instance that is met, for rays of the scene; without it those of a shape in a
-            group are in the frame of the group.
+        transform: the `InstanceTransform` of the instance that is met, for rays of the scene; without it rays of a
+            shape in a group are in the frame of the group.
         lost: share of the rays that enter it and do not leave again.
     """
 
@@ -205,7 +205,7 @@ class Geometry:
     state: Snapshot
     contents: Any = None
     group: Any = None
-    pose: Any = None
+    transform: Any = None
     lost: float = 0.0
 
     @property
@@ -232,11 +232,11 @@ class Geometry:
     @property
     def clearance(self) -> mi.Float:
         """`rounding` as data of kernels; of an instance where that stands."""
-        return dr.opaque(mi.Float, self.rounding) if self.pose is None else self.pose.rounding
+        return dr.opaque(mi.Float, self.rounding) if self.transform is None else self.transform.rounding
 
-    def placed(self, pose: Any) -> Geometry:
-        """As the instance of a pose shows it, its size that of the largest."""
-        return replace(self, pose=pose, size=self.size * self.group.longest)
+    def as_instance(self, transform: Any) -> Geometry:
+        """The geometry of one instance; its size is that of the largest."""
+        return replace(self, transform=transform, size=self.size * self.group.longest)
 
     def ray_intersect(
         self, ray: mi.Ray3f, flags: int, coherent: bool = False, active: mi.Bool | bool = True
@@ -244,14 +244,18 @@ class Geometry:
         """What a ray meets of the shape alone."""
         if self.group is None:
             return self.scene.ray_intersect(ray, flags, coherent, active)
-        if self.pose is None:
+        if self.transform is None:
             return meet_alone(self.scene, ray, flags, active)
-        si = self.pose.shown(meet_alone(self.scene, self.pose.ray_into(ray), flags, active), flags)
+        si = self.transform.interaction_to_world(
+            meet_alone(self.scene, self.transform.ray_to_object(ray), flags, active), flags
+        )
         return completed(si, si, ray, flags, active & si.is_valid())
 
     def ray_test(self, ray: mi.Ray3f, coherent: bool = False, active: mi.Bool | bool = True) -> mi.Bool:
         """Whether a ray meets the shape."""
-        return self.scene.ray_test(ray if self.pose is None else self.pose.ray_into(ray), coherent, active)
+        return self.scene.ray_test(
+            ray if self.transform is None else self.transform.ray_to_object(ray), coherent, active
+        )
 
     @property
     def upright(self) -> bool:

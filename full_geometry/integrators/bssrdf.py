@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import drjit as dr
 import mitsuba as mi
 
-from full_geometry.geometry.instances import Sight
+from full_geometry.geometry.instances import InstanceScene
 from full_geometry.geometry.sensors import (
     past_emitters,
     rays_by,
@@ -193,8 +193,8 @@ def _class(variant: str) -> type:
 
 def shown(scene: mi.Scene, objects: list[TranslucentObject], settings: Settings, ray: mi.Ray3f) -> mi.Ray3f:
     """The rays of a camera, which begin behind emitters that it does not see."""
-    sight = objects[0].sight if objects else Sight.of(scene, [])
-    return past_emitters(scene, sight, ray) if settings.hide_emitters else ray
+    instance_scene = objects[0].instance_scene if objects else InstanceScene.of(scene, [])
+    return past_emitters(scene, instance_scene, ray) if settings.hide_emitters else ray
 
 
 @contextmanager

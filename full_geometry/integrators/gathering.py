@@ -42,7 +42,7 @@ from full_geometry.sampling.light_points import GOLDEN, SurfacePoints
 from halfspace_sss.backend import clock
 
 if TYPE_CHECKING:
-    from full_geometry.geometry.instances import Sight
+    from full_geometry.geometry.instances import InstanceScene
     from full_geometry.geometry.points import SurfacePoint
     from full_geometry.objects.objects import TranslucentObject
     from full_geometry.settings import Settings
@@ -274,7 +274,7 @@ def _incident(
     point = j % _numbers(count)[0]
     at = GatheringPoint(*(dr.gather(type(v), v, point) for v in (T.points.p, T.points.n, T.points.n_out)), e)
     u, v = (_stratified(sampler, j, s, each) for _ in range(2))
-    aimed, w_e = by_emitters(scene, objects[0].sight, T.albedo, at, u)
+    aimed, w_e = by_emitters(scene, objects[0].instance_scene, T.albedo, at, u)
     met, more, a, w_c, on = by_cosine(scene, objects, T.albedo, settings, at, v, traced, sampler)
     around = T.around
     centre = dr.gather(mi.Vector3f, mi.Vector3f(around.middle.T.astype(np.float32)), point)
@@ -363,14 +363,19 @@ def _weight(albedo: Albedo, at: GatheringPoint, w: mi.Vector3f) -> tuple[mi.Spec
 
 
 def by_emitters(
-    scene: mi.Scene, sight: Sight, albedo: Albedo, at: GatheringPoint, u: mi.Point2f, c: mi.Spectrum | float = 0.0
+    scene: mi.Scene,
+    instance_scene: InstanceScene,
+    albedo: Albedo,
+    at: GatheringPoint,
+    u: mi.Point2f,
+    c: mi.Spectrum | float = 0.0,
 ) -> tuple[mi.Spectrum, mi.Vector3f]:
     """Light of sampled emitters less c of the sky, and its direction."""
     here = place(at.p, at.n)
     ds, light = scene.sample_emitter_direction(here, u, False)
     a, pdf = _weight(albedo, at, ds.d)
     above = (ds.pdf > 0) & (pdf > 0)
-    light = dr.select(blocked(scene, sight.ray_to_emitter(here, ds, at.e), above), 0, light)
+    light = dr.select(blocked(scene, instance_scene.ray_to_emitter(here, ds, at.e), above), 0, light)
     light -= dr.select(ds.emitter.is_environment(), c / dr.maximum(ds.pdf, 1e-30), 0)
     share = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
     return dr.select(above, a * pdf * light * share, 0), ds.d
@@ -384,7 +389,7 @@ def by_cosine(
 
     Last comes along which.
     """
-    met, a, w, ray, si = met_by_cosine(scene, objects[0].sight, albedo, at, u)
+    met, a, w, ray, si = met_by_cosine(scene, objects[0].instance_scene, albedo, at, u)
     hidden = replace(settings, hide_emitters=True, light="sampled", max_depth=max(settings.max_depth - 1, -1) or 1)
     on = si.is_valid() & traced
     parts, *_ = trace_paths(scene, objects, hidden, sampler, ray, on, scattered=True)
@@ -392,14 +397,19 @@ def by_cosine(
 
 
 def met_by_cosine(
-    scene: mi.Scene, sight: Sight, albedo: Albedo, at: GatheringPoint, u: mi.Point2f, c: mi.Spectrum | float = 0.0
+    scene: mi.Scene,
+    instance_scene: InstanceScene,
+    albedo: Albedo,
+    at: GatheringPoint,
+    u: mi.Point2f,
+    c: mi.Spectrum | float = 0.0,
 ) -> tuple[mi.Spectrum, mi.Spectrum, mi.Vector3f, mi.Ray3f, mi.SurfaceInteraction3f]:
     """Light of emitters that a direction of the cosine meets, less c of the sky; a, that direction, its ray and hit."""
     w, _ = cosine_above(at.n_out, at.n, u)
     a, pdf = _weight(albedo, at, w)
     here = place(at.p, at.n)
     ray = ray_from(here, w, at.e)
-    si = sight.intersect(scene, ray, mi.RayFlags.All, True)
+    si = instance_scene.intersect(scene, ray, mi.RayFlags.All, True)
     emitter = si.emitter(scene)
     shines = emitter != None  # noqa: E711
     density = scene.pdf_emitter_direction(here, mi.DirectionSample3f(scene, si, here), shines)

@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.geometry.instances import Pose, Sight
+from full_geometry.geometry.instances import InstanceScene, InstanceTransform
 from full_geometry.geometry.rounding import blocked
 from full_geometry.objects.objects import TranslucentObject
 from full_geometry.objects.small_emitters import WIDE, SmallEmitters, is_delta
@@ -224,17 +224,17 @@ class RenderContext:
         return cls(scene, lights, objects, settings, mode, Sky.of(scene, lights, objects), small)
 
     @cached_property
-    def sight(self) -> Sight:
+    def instance_scene(self) -> InstanceScene:
         """What rays meet in the scene."""
-        return self.objects[0].sight if self.objects else Sight.of(self.scene, [])
+        return self.objects[0].instance_scene if self.objects else InstanceScene.of(self.scene, [])
 
     def ray_intersect(self, ray: mi.Ray3f, coherent: mi.Bool | bool, active: mi.Bool) -> mi.SurfaceInteraction3f:
         """What a ray meets, with all that is known of the surface there."""
-        return self.sight.intersect(self.scene, ray, mi.RayFlags.All, coherent, active)
+        return self.instance_scene.intersect(self.scene, ray, mi.RayFlags.All, coherent, active)
 
-    def pose(self, si: mi.SurfaceInteraction3f) -> Pose | None:
+    def instance_transform(self, si: mi.SurfaceInteraction3f) -> InstanceTransform | None:
         """Where the instance stands that a ray has met; None where no object is shown by one."""
-        return self.sight.pose(si) if any(obj.repeated for obj in self.objects) else None
+        return self.instance_scene.transform(si) if any(obj.repeated for obj in self.objects) else None
 
     @property
     def suns(self) -> bool:
@@ -297,7 +297,7 @@ def sample_emitter(
     with dr.suspend_grad():
         ds, light = context.scene.sample_emitter_direction(ref, u, False, active)
         if seen:
-            shadow = context.sight.ray_to_emitter(ref, ds, context.sight.rounding(ref))
+            shadow = context.instance_scene.ray_to_emitter(ref, ds, context.instance_scene.rounding(ref))
             hidden = blocked(context.scene, shadow, active & (ds.pdf > 0))
             ds.pdf, light = dr.select(hidden, 0, ds.pdf), dr.select(hidden, 0, light)
         inverse = dr.select(ds.pdf > 0, dr.rcp(ds.pdf), 0)

@@ -526,7 +526,9 @@ def _way(context: RenderContext, obj: TranslucentObject, walk: _Walk, target: _T
     valid &= dr.dot(ds.n, met.w) <= 0
     spread = dr.select(ds.delta | ~alone, 1, facing) * reach * reach * met.density
     weight_sky = mis_weight(ds.pdf, _phase_pdf(obj, walk, met) * met.T * spread)
-    shadow = ray_to(place(met.p, met.n), target.p, obj.geometry.clearance, context.sight.rounding_of(ds.emitter))
+    shadow = ray_to(
+        place(met.p, met.n), target.p, obj.geometry.clearance, context.instance_scene.rounding_of(ds.emitter)
+    )
     valid &= ~blocked(context.scene, shadow, valid)
     passed = dr.select(valid, met.T * spread * dr.select(alone, 1, weight_sky), 0)
     return _Way(mi.Vector3f(met.d), mi.Float(met.length), passed)

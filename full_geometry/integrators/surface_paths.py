@@ -316,7 +316,7 @@ def sample_event(
     choices = []
     with dr.suspend_grad():
         for known in context.objects:
-            here, obj = _met(known, at), known.at(context.pose(at.si))
+            here, obj = _met(known, at), known.at(context.instance_transform(at.si))
             choice = choose_event(obj, at.si, here)
             if obj.splits:
                 low = dr.select(at.low_only, mi.Float(1), dr.select(at.others_only, 0, choice.low_orders))
@@ -551,7 +551,7 @@ def bsdf_event(
     bs = dr.detach(bs)
     delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     previous = PreviousVertex(
-        mi.Point3f(si.p), mi.Normal3f(si.n), context.sight.rounding(si), dr.select(delta, 1, bs.pdf),
+        mi.Point3f(si.p), mi.Normal3f(si.n), context.instance_scene.rounding(si), dr.select(delta, 1, bs.pdf),
         dr.select(delta, mi.Float(0), 1), mi.Bool(False), mi.Float(-1), delta, mi.Bool(False),
     )  # fmt: skip
     return NextVertex(previous, si.to_world(bs.wo), weight, ~delta), direct

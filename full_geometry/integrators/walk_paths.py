@@ -231,8 +231,8 @@ class LightVisitor:
         ctx.type_mask = mi.BSDFFlags.DeltaReflection
         bs, value = bsdf.sample(ctx, si, 0.0, mi.Point2f(0), active)
         d, _ = sided(si, bs.wo)
-        ray = ray_from(si, d, self.media.sight.rounding(si))
-        met = self.media.sight.intersect(self.scene, ray, mi.RayFlags.All, active=active)
+        ray = ray_from(si, d, self.media.instance_scene.rounding(si))
+        met = self.media.instance_scene.intersect(self.scene, ray, mi.RayFlags.All, active=active)
         emitter = met.emitter(self.scene, active)
         active = active & (emitter != None) & (bs.pdf > 0)  # noqa: E711
         return dr.select(active, walk.weight * value * emitter.eval(met, active), 0)
@@ -288,7 +288,7 @@ class LightVisitor:
         active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         ds, light = self.scene.sample_emitter_direction(si, u, False, active)
         active &= (ds.pdf > 0) & (~mi.Bool(outwards) | (dr.dot(ds.d, si.n) > 0))
-        shadow = self.media.sight.ray_to_emitter(si, ds, self.media.sight.rounding(si))
+        shadow = self.media.instance_scene.ray_to_emitter(si, ds, self.media.instance_scene.rounding(si))
         active &= ~blocked(self.scene, shadow, active)
         wo = si.to_local(ds.d)
         below = outwards & (wo.z < 0)  # comes from inside by the opposite direction, and is not mirrored
@@ -412,13 +412,13 @@ class PathTracer:
 
     def shown(self, rays: mi.Ray3f) -> mi.Ray3f:
         """The rays of a camera, which begin behind emitters that it does not see."""
-        scene, sight = self.visitor.scene, self.visitor.media.sight
-        return past_emitters(scene, sight, rays) if self.hide_emitters else rays
+        scene, instance_scene = self.visitor.scene, self.visitor.media.instance_scene
+        return past_emitters(scene, instance_scene, rays) if self.hide_emitters else rays
 
     def _outside(self, p: CameraPath) -> CameraPath:
         """A ray outside all objects, and the surface that it meets."""
         ray = ray_of(p.walk.o, p.walk.d, p.walk.medium)
-        si = self.visitor.media.sight.intersect(self.visitor.scene, ray, mi.RayFlags.All)
+        si = self.visitor.media.instance_scene.intersect(self.visitor.scene, ray, mi.RayFlags.All)
 
         # ---- emission, with its MIS weight
         first = p.depth == 0
@@ -568,7 +568,7 @@ class FirstExits:
     @classmethod
     def of(cls, scene: mi.Scene, media: WalkMedia, rays: mi.Ray3f) -> FirstExits:
         """What rays of the camera meet first, and room for where their walks leave."""
-        si = media.sight.intersect(scene, rays, mi.RayFlags.All, coherent=True)
+        si = media.instance_scene.intersect(scene, rays, mi.RayFlags.All, coherent=True)
         k = media.index_of(si, si.is_valid())
         si = media.seen(si, k, rays.d)
         n = dr.width(rays)

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.geometry.instances import Placed, corners, ends_of, shapes_of, shown_groups
+from full_geometry.geometry.instances import InstanceTable, corners, ends_of, shapes_of, shown_groups
 from full_geometry.geometry.shape import Geometry, is_inside, meet_alone, name_of, scene_of, ways_into
 from full_geometry.surface.wrapped import surface_of
 
@@ -35,7 +35,7 @@ class Content:
     Args:
         thing: a shape, or an emitter that has none.
         name: what messages call it.
-        object: the number of the object, see `instances.Placed`.
+        object: the number of the object, see `instances.InstanceTable`.
         whole: whether all of it lies inside.
         rank: the number of its instance in the group, if it is shown by one.
         shown: whether it is.
@@ -58,8 +58,8 @@ def contents(scene: mi.Scene, objects: list[Geometry]) -> list[Content]:
         ValueError: the surface of such a shape lies on that of an object, so that rays do not tell which comes first.
     """
     groups, results = shown_groups(scene), []
-    holders = Placed.of([obj.shape for obj in objects], groups)
-    things = Placed.of(shapes_of(scene, groups), groups)
+    holders = InstanceTable.of([obj.shape for obj in objects], groups)
+    things = InstanceTable.of(shapes_of(scene, groups), groups)
     for a, shape in enumerate(things.shapes):
         alone, group = None, things.groups[a]
         for b, holder in enumerate(objects):
@@ -109,7 +109,7 @@ class _Pairs(NamedTuple):
 _NONE = _Pairs(*(np.zeros(0, dtype=int),) * 2, *(np.zeros((0, 4, 4)),) * 2, *(np.zeros((0, 3)),) * 2, np.zeros(0))
 
 
-def _meeting(things: Placed, a: int, holders: Placed, b: int) -> _Pairs:
+def _meeting(things: InstanceTable, a: int, holders: InstanceTable, b: int) -> _Pairs:
     """Copies of a shape and of an object, not the same, that share a box which reaches deep, or touches if it tells."""
     same, one = things.shapes[a] is holders.shapes[b], np.eye(4)[None]
     together = things.groups[a] is not None and things.groups[a] is holders.groups[b]
@@ -228,9 +228,9 @@ def _tells(shape: mi.Shape) -> bool:
     return shape.is_emitter() or bool(surface_of(shape)) or refracts(shape)
 
 
-def _rounding_of(placed: Placed, kind: int) -> np.ndarray:
-    """Of the things of a shape, see `Placed.rounding`; in a group looked at once for all, of the first."""
-    return placed.rounding[placed.numbers(kind)]
+def _rounding_of(instance_table: InstanceTable, kind: int) -> np.ndarray:
+    """Of the things of a shape, see `InstanceTable.rounding`; in a group looked at once for all, of the first."""
+    return instance_table.rounding[instance_table.numbers(kind)]
 
 
 def _check_apart(pairs: _Pairs, of: tuple[mi.Shape, mi.Scene], holder: Geometry) -> None:
@@ -282,7 +282,7 @@ def check_sensors(scene: mi.Scene, objects: list[Geometry]) -> None:
     Raises:
         ValueError: rays of a sensor begin inside an object, whose id is named.
     """
-    holders = Placed.of([obj.shape for obj in objects], shown_groups(scene))
+    holders = InstanceTable.of([obj.shape for obj in objects], shown_groups(scene))
     for sensor in scene.sensors():
         for b, each in enumerate(objects):
             if is_inside(each, _into(holders.to_world(b), _starts(sensor, each.size))).any():

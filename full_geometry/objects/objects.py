@@ -19,11 +19,11 @@ import numpy as np
 
 from full_geometry.geometry.instances import (
     Group,
-    Placed,
-    PlacedProposals,
-    PlacedTransport,
-    Pose,
-    Sight,
+    InstanceProposals,
+    InstanceScene,
+    InstanceTable,
+    InstanceTransform,
+    InstanceTransport,
     shapes_of,
     shown_groups,
 )
@@ -121,7 +121,7 @@ def filled(scene: mi.Scene, objects: list[Geometry], mm_per_unit: float, what: s
         ValueError: names such a thing and the object.
     """
     result = contents(scene, objects)
-    kinds = Placed.of([obj.shape for obj in objects], shown_groups(scene)).kind
+    kinds = InstanceTable.of([obj.shape for obj in objects], shown_groups(scene)).kind
     for content in result:
         holder = objects[kinds[content.object]]
         lamp = isinstance(content.thing, mi.Emitter) or content.thing.is_emitter()
@@ -233,7 +233,7 @@ class TranslucentObject:
         variation: how its light varies with its medium.
         gathered: what leaves by orders from two on, in place of a transport, see `integrators.gathering`.
         painted: its shape as it was, whose attributes textures show, if the surface has textures.
-        sight: of the scene that it is rendered in.
+        instance_scene: of the scene that it is rendered in.
     """
 
     geometry: Geometry
@@ -249,27 +249,27 @@ class TranslucentObject:
     variation: Variation | None = None
     gathered: Any = None
     painted: Snapshot | None = None
-    sight: Sight = Sight([], {})
+    instance_scene: InstanceScene = InstanceScene([], {})
 
     @property
     def repeated(self) -> bool:
         """Whether instances show it."""
         return self.geometry.group is not None
 
-    def at(self, pose: Pose | None) -> TranslucentObject:
-        """It as the instance that is met shows it; itself where it stands in the scene.
+    def at(self, transform: InstanceTransform | None) -> TranslucentObject:
+        """The object as the instance that a ray has met; itself where it stands in the scene.
 
         S of the half-space is asked for in the scene, that of a whole object in the frame of the group.
         """
         if not self.repeated:
             return self
-        geometry, transport, proposals = self.geometry.placed(pose), self.transport, self.proposals
+        geometry, transport, proposals = self.geometry.as_instance(transform), self.transport, self.proposals
         if transport is not None and not transport.is_delta:
-            proposals = PlacedProposals(proposals, pose)
+            proposals = InstanceProposals(proposals, transform)
             if self.is_mixed:
                 transport = replace(transport, obj=geometry)
             elif lookup(self.variation.model).transport is not None:
-                transport = PlacedTransport(transport, pose)
+                transport = InstanceTransport(transport, transform)
         return replace(self, geometry=geometry, transport=transport, proposals=proposals)
 
     @property

@@ -185,7 +185,9 @@ def _own_hit(media: WalkMedia, k: mi.Int32, ray: mi.Ray3f) -> tuple[mi.Float, mi
     """Distance to the surface of object k along a ray, whether it is met, and whether the ray leaves the object."""
 
     def nearer(t: mi.Float, found: mi.Bool, leaves: mi.Bool, going: mi.Bool) -> tuple:
-        si = media.sight.intersect(media.scene, mi.Ray3f(ray.o + ray.d * t, ray.d), mi.RayFlags.Minimal, active=going)
+        si = media.instance_scene.intersect(
+            media.scene, mi.Ray3f(ray.o + ray.d * t, ray.d), mi.RayFlags.Minimal, active=going
+        )
         hit = going & si.is_valid()
         own = hit & (media.met(si, k) == k)
         out = dr.dot(si.n, ray.d) * media.side(k, si.prim_index) > 0

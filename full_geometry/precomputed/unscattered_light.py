@@ -34,7 +34,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.geometry.instances import Pose, corners, ends_of
+from full_geometry.geometry.instances import InstanceTransform, corners, ends_of
 from full_geometry.geometry.points import EntrySample, cosine_above, cosine_density, lift, opaque, sided
 from full_geometry.geometry.rounding import blocked, ray_from
 from full_geometry.precomputed.inside_cells import POINTS, InsideCells, grid_edge
@@ -158,7 +158,7 @@ def obstacle(media: WalkMedia) -> str:
         return f"the variant {mi.variant()} has no light by channel"
     if media.inner is not None:
         return "something lies inside an object"
-    for k, kind in enumerate(media.placed.kind):
+    for k, kind in enumerate(media.instance_table.kind):
         h = _edges(media, k, EDGE)[1] * media.mm_per_unit * float(np.mean(media.insides[kind].medium.sigma_t))
         if h > MOST_EDGE:
             return f"object {media.objects[kind].name} is so many mean free paths wide that cells have {h:.2g}"
@@ -179,7 +179,7 @@ def obstacle(media: WalkMedia) -> str:
 def inside_cells_of(media: WalkMedia, edge: float = EDGE) -> list[InsideCells]:
     """The cells of all objects, `edge` mean free paths wide."""
     results = []
-    for k, kind in enumerate(media.placed.kind):
+    for k, kind in enumerate(media.instance_table.kind):
         sigma_t = media.mm_per_unit * np.atleast_1d(media.insides[kind].medium.sigma_t)
         box, h = _edges(media, k, edge)
         depth = np.inf if media.varies else DEPTH / float(np.min(sigma_t))
@@ -194,7 +194,7 @@ def inside_cells_of(media: WalkMedia, edge: float = EDGE) -> list[InsideCells]:
 
 def _edges(media: WalkMedia, k: int, edge: float) -> tuple[tuple[np.ndarray, np.ndarray], float]:
     """The box of object k, and the edge of its cells, scene units."""
-    kind = media.placed.kind[k]
+    kind = media.instance_table.kind[k]
     low, high = ends_of(corners(media.objects[kind].scene.bbox(), _to_world(media, k)[None]))
     sigma_t = media.mm_per_unit * float(np.mean(media.insides[kind].medium.sigma_t))
     return (low[0], high[0]), grid_edge((low[0], high[0]), edge / sigma_t)
@@ -202,19 +202,19 @@ def _edges(media: WalkMedia, k: int, edge: float) -> tuple[tuple[np.ndarray, np.
 
 def _to_world(media: WalkMedia, k: int) -> np.ndarray:
     """Where object k stands: the matrix of an instance."""
-    kind = int(media.placed.kind[k])
-    return media.placed.to_world(kind)[k - int(media.placed.first[kind])]
+    kind = int(media.instance_table.kind[k])
+    return media.instance_table.to_world(kind)[k - int(media.instance_table.first[kind])]
 
 
 def _entries(media: WalkMedia, k: int, u: list[mi.Float]) -> EntrySample:
     """Points uniform over the surface of object k, in an instance over that in its group; the weight is 1 / density."""
-    kind = int(media.placed.kind[k])
+    kind = int(media.instance_table.kind[k])
     entries = uniform_entries(media.objects[kind], u[0], mi.Point2f(u[1], u[2]))
-    if media.placed.groups[kind] is None:
+    if media.instance_table.groups[kind] is None:
         return entries
     M = _to_world(media, k)
     columns = [[mi.Vector3f(*(opaque(v) for v in column)) for column in m[:3].T] for m in (M, np.linalg.inv(M))]
-    return Pose(*columns, mi.Float(0)).entry(entries)
+    return InstanceTransform(*columns, mi.Float(0)).entry_to_world(entries)
 
 
 @dataclass
@@ -292,18 +292,20 @@ class _Rays:
         A share of them is drawn by the cosine, for lamps so near that those of the emitters miss them (balance
         heuristic over one sample): L / ((1 - BY_COSINE) p_emitter + BY_COSINE p_cosine).
         """
-        scene, sight = self.scene, self.media.sight
+        scene, instance_scene = self.scene, self.media.instance_scene
 
         # ---- by the emitters
         ds, light = scene.sample_emitter_direction(si, u, False)
-        shadow = sight.ray_to_emitter(si, ds, self.media.row("rounding", self.k))
+        shadow = instance_scene.ray_to_emitter(si, ds, self.media.row("rounding", self.k))
         delta, active = mi.Bool(ds.delta), ds.pdf > 0
         light = dr.select(active & ~blocked(scene, shadow, active), light * ds.pdf, 0)
 
         # ---- by the cosine
         w, _ = cosine_above(si.sh_frame.n, si.n, u)
         drawn = rng.next_float32() < BY_COSINE
-        met = sight.intersect(scene, ray_from(si, w, self.media.row("rounding", self.k)), mi.RayFlags.All, active=drawn)
+        met = instance_scene.intersect(
+            scene, ray_from(si, w, self.media.row("rounding", self.k)), mi.RayFlags.All, active=drawn
+        )
         emitter = met.emitter(scene, drawn)
         found = drawn & (emitter != None)  # noqa: E711
         there = mi.DirectionSample3f(scene, met, si)
@@ -319,7 +321,9 @@ class _Rays:
     def segment(self, ray: _Ray) -> _Ray:
         """Light along a ray as far as the surface, and its reflection there."""
         media, d, rng = self.media, ray.d, ray.rng
-        si = media.sight.intersect(media.scene, mi.Ray3f(ray.o + ray.off, d), mi.RayFlags.All, active=ray.alive)
+        si = media.instance_scene.intersect(
+            media.scene, mi.Ray3f(ray.o + ray.off, d), mi.RayFlags.All, active=ray.alive
+        )
         alive = ray.alive & si.is_valid()
         far = dr.select(alive, dr.maximum(si.t + dr.dot(ray.off, d), 0), 0)
 

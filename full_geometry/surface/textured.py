@@ -270,8 +270,8 @@ def _interaction(
     obj: Geometry, p: mi.Point3f, n: mi.Normal3f, face: mi.UInt32 | None, active: mi.Bool
 ) -> mi.SurfaceInteraction3f:
     """What textures ask for, at a point of an object: of a mesh from its face, else where a short ray meets it."""
-    if obj.pose is not None:
-        p, n, obj = obj.pose.point_into(p), obj.pose.normal_into(n), replace(obj, pose=None)
+    if obj.transform is not None:
+        p, n, obj = obj.transform.point_to_object(p), obj.transform.normal_to_object(n), replace(obj, transform=None)
     if face is None or not obj.shape.is_mesh():
         off = dr.maximum(10 * obj.clearance, opaque(1e-5 * obj.size))
         ray = mi.Ray3f(mi.Point3f(p + n * off), mi.Vector3f(-n))

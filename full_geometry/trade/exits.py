@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.geometry.instances import Sight, bounds_of
+from full_geometry.geometry.instances import InstanceScene, bounds_of
 from full_geometry.geometry.rounding import ray_from
 from full_geometry.precomputed.transfer import R_2
 from full_geometry.surface.wrapped import surface_of
@@ -102,7 +102,7 @@ def _look(scene: Any, camera: Any, shapes: list[Any], seed: tuple[int, int]) -> 
 
 def _shows_lamp(scene: Any, shapes: list[Any], si: Any, through: bool) -> Any:
     """Whether smooth boundaries show an emitter other than the environment, as mirrors or `through` clear objects."""
-    active, result, sight = si.is_valid(), mi.Bool(False), Sight([], {}, bounds_of(scene.shapes()))
+    active, result, instance_scene = si.is_valid(), mi.Bool(False), InstanceScene([], {}, bounds_of(scene.shapes()))
     for _ in range(CHAIN):
         eta, translucent = mi.Float(1), mi.Bool(False)
         for shape in shapes:
@@ -116,7 +116,7 @@ def _shows_lamp(scene: Any, shapes: list[Any], si: Any, through: bool) -> Any:
         reflectance, cosine_t, _, eta_ti = mi.fresnel(cosine, eta)
         passes = ((cosine < 0) | through) & (reflectance < 1)
         onwards = dr.select(passes, mi.refract(si.wi, cosine_t, eta_ti), mi.reflect(si.wi))
-        onward = ray_from(si, si.to_world(onwards), sight.rounding(si))
+        onward = ray_from(si, si.to_world(onwards), instance_scene.rounding(si))
         si = scene.ray_intersect(onward, mi.RayFlags.All, False, active)
         active &= si.is_valid()
         result |= active & (si.emitter(scene) != None)  # noqa: E711

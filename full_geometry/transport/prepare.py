@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.geometry.instances import (
-    Sight,
+    InstanceScene,
     shown_groups,
 )
 from full_geometry.geometry.points import (
@@ -190,7 +190,7 @@ class TranslucentObjects:
         if current and places != self._places:
             results = [obj.geometry for obj in objects]
             current = not any(geometry.contents for geometry in results) and not contents(scene, results)
-            current = current and not objects[0].sight.shapes
+            current = current and not objects[0].instance_scene.shapes
         if not current:
             if not (objects and same):
                 self.choices = _choices(scene, self.settings)
@@ -232,5 +232,5 @@ def make_objects(
         if each.group is not None:
             _check_repeated(each, inside, settings)
     results = [_make_object(each, equivalent(inside, each), settings) for each, inside in zip(named, insides)]
-    sight = Sight.of(scene, groups)
-    return [replace(obj, sight=sight) for obj in results]
+    instance_scene = InstanceScene.of(scene, groups)
+    return [replace(obj, instance_scene=instance_scene) for obj in results]

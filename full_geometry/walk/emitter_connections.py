@@ -127,7 +127,7 @@ class SubpathConnections:
         p, k, m = event.p, event.object, event.m
         ray = mi.Ray3f(p, w_0)
         ray.maxt = DEEPEST / dr.min(m.mean_t)
-        si = self.media.sight.intersect(self.media.scene, ray, mi.RayFlags.Minimal)
+        si = self.media.instance_scene.intersect(self.media.scene, ray, mi.RayFlags.Minimal)
         n = si.n * self.media.side(k, si.prim_index)
         facing = si.is_valid() & (dr.dot(n, w_0) > 0)
         far = dr.select(si.is_valid(), si.t, ray.maxt)
@@ -153,7 +153,7 @@ class SubpathConnections:
         near = distance - before(at.p + w * distance, distance, self.small.rounding(which))
         away = dr.select(distant, 4 * dr.norm(self.scene.bbox().extents()), near)
         way = mi.Ray3f(mi.Point3f(at.p + w * away), -w)
-        si = self.media.sight.intersect(self.scene, way, mi.RayFlags.All)
+        si = self.media.instance_scene.intersect(self.scene, way, mi.RayFlags.All)
         steep = dr.abs(dr.dot(w, sample.w_0)) > STEEPEST
         enters = si.is_valid() & (dr.max(light) > 0) & steep & (self.media.index_of(si) == mi.Int32(k))
 
@@ -243,7 +243,7 @@ class SubpathConnections:
     def _reflect(self, walk: Walk, lit: mi.Bool, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f) -> tuple:
         """Reflection at the boundary from inside with the probability of its reflectance, after which a ray is lit."""
         k, d = mi.Int32(walk.object), walk.d
-        si = self.media.sight.interaction(hit, ray, mi.RayFlags.All)
+        si = self.media.instance_scene.interaction(hit, ray, mi.RayFlags.All)
         si = self.media.seen(si, k, d)
         F, _, _, _ = mi.fresnel(mi.Frame3f.cos_theta(si.wi), self.media.row("eta", k))
         new, _ = sided(si, mi.reflect(si.wi))
@@ -341,7 +341,7 @@ class EmitterDirections:
         for _ in range(GUESSES):
             ray = mi.Ray3f(v, d)
             ray.maxt = DEEPEST / dr.min(m.mean_t)
-            si = self.media.sight.intersect(self.media.scene, ray, mi.RayFlags.Minimal, active=valid)
+            si = self.media.instance_scene.intersect(self.media.scene, ray, mi.RayFlags.Minimal, active=valid)
             valid &= si.is_valid()
             n = si.n * self.media.side(k, si.prim_index)
             w, _ = self.small.direction(which, si.p)
@@ -360,14 +360,14 @@ class EmitterDirections:
         d, pdf = _draw_lobe(guess, concentration, rng)
         ray = ray_of(v, d, event.medium)
         ray.maxt = 2 * DEEPEST / dr.min(m.mean_t)
-        si = self.media.sight.intersect(self.media.scene, ray, mi.RayFlags.All, active=valid)
+        si = self.media.instance_scene.intersect(self.media.scene, ray, mi.RayFlags.All, active=valid)
         valid &= si.is_valid() & (self.media.index_of(si) == k)
         si = self.media.seen(si, k, d)
         F, cos_t, eta_it, eta_ti = mi.fresnel(mi.Frame3f.cos_theta(si.wi), self.media.row("eta", k))
         w = opposed(si.to_world(mi.refract(si.wi, cos_t, eta_ti)), si.n)
         valid &= (dr.dot(d, si.n) > 0) & (dr.dot(w, si.n) > 0) & (F < 1)
-        way = ray_from(si, w, self.media.sight.rounding(si))
-        outside = self.media.sight.intersect(self.scene, way, mi.RayFlags.All, active=valid)
+        way = ray_from(si, w, self.media.instance_scene.rounding(si))
+        outside = self.media.instance_scene.intersect(self.scene, way, mi.RayFlags.All, active=valid)
         phase = eval_phase(m, dr.dot(event.along, d))
         # radiance shrinks by eta² on its way out, as the weight of the walk has when it came in
         factor = (1 - F) * dr.square(eta_ti) / (pdf / n + channel_mean(phase))

@@ -10,7 +10,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.geometry.instances import Group, Placed, Sight, bounds_of, corners, ends_of, shown_groups
+from full_geometry.geometry.instances import (
+    Group,
+    InstanceScene,
+    InstanceTable,
+    bounds_of,
+    corners,
+    ends_of,
+    shown_groups,
+)
 from full_geometry.geometry.points import lift
 from full_geometry.geometry.rounding import clear
 from full_geometry.geometry.shape import Geometry, check_together, pointer_numbers, scene_of, survey
@@ -39,14 +47,14 @@ class InnerShapes:
 
     Args:
         scene: a Mitsuba scene that holds the objects, and the shapes inside or partly inside them.
-        placed: these shapes at their places, which are numbered.
+        instance_table: numbers of these shapes and of their instances.
         tables: by these numbers, the number of the object `around` a shape or -1, and whether it `displaces` that; by
             the number of an object, whether it stands `alone`, neither in another nor around anything.
         lights: the delta lights in the medium of an object, and its number.
     """
 
     scene: mi.Scene
-    placed: Placed
+    instance_table: InstanceTable
     tables: dict[str, Any]
     lights: list[tuple[mi.Emitter, int]]
 
@@ -61,7 +69,7 @@ class InnerShapes:
         if not result:
             return None
         groups = shown_groups(scene)
-        own = Placed.of([obj.shape for obj in objects], groups)
+        own = InstanceTable.of([obj.shape for obj in objects], groups)
         _check(result, objects, own)
         glass = [survey(thing, scene) for thing in _shapes(result) if _displaces(thing)]
         for piece in glass:
@@ -69,13 +77,13 @@ class InnerShapes:
                 raise ValueError(f"what refracts inside an object must be closed, got the shape {piece.name}")
         if glass:
             result = contents(scene, [*objects, *glass])
-        holders = Placed.of([obj.shape for obj in (*objects, *glass)], groups)
+        holders = InstanceTable.of([obj.shape for obj in (*objects, *glass)], groups)
         inside = [content for content in result if content.object < len(own)]
         things = [thing for thing in _shapes(inside) if not any(thing is shape for shape in own.shapes)]
-        placed = Placed.of([*own.shapes, *things], groups)
-        first = {id(shape): int(number) for shape, number in zip(placed.shapes, placed.first)}
-        around, lights = np.full(len(placed), -1), {}
-        holding, held = np.zeros(len(own), dtype=bool), np.zeros(len(placed), dtype=bool)
+        instance_table = InstanceTable.of([*own.shapes, *things], groups)
+        first = {id(shape): int(number) for shape, number in zip(instance_table.shapes, instance_table.first)}
+        around, lights = np.full(len(instance_table), -1), {}
+        holding, held = np.zeros(len(own), dtype=bool), np.zeros(len(instance_table), dtype=bool)
         for content in _largest_first(result, holders):
             number = content.object if content.object < len(own) else -1
             if isinstance(content.thing, mi.Emitter):
@@ -84,13 +92,13 @@ class InnerShapes:
                 place = first[id(content.thing)] + content.rank
                 around[place], held[place] = number, held[place] or number >= 0
             holding[[number] if number >= 0 else []] = True
-        displaces = [_displaces(shape) for shape in placed.shapes]
+        displaces = [_displaces(shape) for shape in instance_table.shapes]
         alone = ~holding & ~held[: len(own)]
         tables = {"around": mi.Int32(around.tolist()), "alone": mi.Bool(alone.tolist())}
-        tables["displaces"] = mi.Bool([displaces[kind] for kind in placed.kind])
+        tables["displaces"] = mi.Bool([displaces[kind] for kind in instance_table.kind])
         dr.make_opaque(tables)
         lights = [(light, k) for light, k in lights.values() if is_delta(light) and k >= 0]
-        return cls(placed.scene(scene), placed, tables, lights)
+        return cls(instance_table.scene(scene), instance_table, tables, lights)
 
     def around(self, si: mi.SurfaceInteraction3f) -> mi.Int32:
         """The number of the object around what a ray has met, or -1."""
@@ -101,7 +109,7 @@ class InnerShapes:
         return self._met("displaces", si, False)
 
     def _met(self, key: str, si: mi.SurfaceInteraction3f, otherwise: int | bool) -> mi.Int32 | mi.Bool:
-        number, table = self.placed.number(si), self.tables[key]
+        number, table = self.instance_table.number(si), self.tables[key]
         return dr.select(number >= 0, dr.gather(type(table), table, dr.maximum(number, 0)), otherwise)
 
 
@@ -113,16 +121,16 @@ def _displaces(shape: mi.Shape) -> bool:
     return not surface_of(shape) and refracts(shape)
 
 
-def _largest_first(result: list[Content], holders: Placed) -> list[Content]:
+def _largest_first(result: list[Content], holders: InstanceTable) -> list[Content]:
     """Sorted by the size of what is around, the smallest last."""
     boxes = [ends_of(corners(shape.bbox(), holders.to_world(k))) for k, shape in enumerate(holders.shapes)]
     sizes = np.concatenate([np.linalg.norm(high - low, axis=1) for low, high in boxes])
     return sorted(result, key=lambda content: -sizes[content.object])
 
 
-def _check(result: list[Content], objects: list[Geometry], placed: Placed) -> None:
+def _check(result: list[Content], objects: list[Geometry], instance_table: InstanceTable) -> None:
     for content in result:
-        holder = objects[placed.kind[content.object]]
+        holder = objects[instance_table.kind[content.object]]
         surfaces = [surface_of(holder.shape)]
         if isinstance(content.thing, mi.Shape):
             translucent = bool(surface_of(content.thing))
@@ -144,11 +152,13 @@ def _check(result: list[Content], objects: list[Geometry], placed: Placed) -> No
                 )
 
 
-def _check_mixes(wrappings: list[Wrapping], objects: list[Geometry], placed: Placed, inner: InnerShapes | None) -> None:
+def _check_mixes(
+    wrappings: list[Wrapping], objects: list[Geometry], instance_table: InstanceTable, inner: InnerShapes | None
+) -> None:
     """ValueError if a mask or blend is on an object inside another, or with something inside."""
-    alone = np.ones(len(placed), dtype=bool) if inner is None else np.array(inner.tables["alone"])
+    alone = np.ones(len(instance_table), dtype=bool) if inner is None else np.array(inner.tables["alone"])
     for kind, (around, obj) in enumerate(zip(wrappings, objects)):
-        if around.mixes and not alone[placed.numbers(kind)].all():
+        if around.mixes and not alone[instance_table.numbers(kind)].all():
             raise ValueError(
                 f"an object with a mask or blendbsdf must be in no other and hold nothing, got object {obj.name}"
             )
@@ -330,7 +340,7 @@ class WalkMedia:
         inner: what lies inside the objects, if anything does.
         wrappings: what is around surfaces, by shape; () where nothing is.
         shown: the groups that the scene shows.
-        sight: what rays meet in it, and in scenes of some of its shapes.
+        instance_scene: intersects rays with it, and with scenes of some of its shapes.
     """
 
     objects: list[Geometry]
@@ -341,12 +351,12 @@ class WalkMedia:
     inner: InnerShapes | None = None
     wrappings: tuple[Wrapping, ...] = ()
     shown: tuple[Group, ...] = ()
-    sight: Sight = Sight([], {})
+    instance_scene: InstanceScene = InstanceScene([], {})
 
     def __post_init__(self) -> None:
-        placed = Placed.of([obj.shape for obj in self.objects], self.shown)
-        object.__setattr__(self, "placed", placed)
-        insides, boundaries = ([rows[kind] for kind in placed.kind] for rows in (self.insides, self.boundaries))
+        instance_table = InstanceTable.of([obj.shape for obj in self.objects], self.shown)
+        object.__setattr__(self, "instance_table", instance_table)
+        insides, boundaries = ([rows[kind] for kind in instance_table.kind] for rows in (self.insides, self.boundaries))
         media, tables = [inside.medium for inside in insides], {}
         for key in ("sigma_t", "sigma_s", "g"):
             scale = 1.0 if key == "g" else self.mm_per_unit
@@ -354,19 +364,19 @@ class WalkMedia:
         tables["eta"] = mi.Float([m.eta for m in media])
         sides = [[obj.sign] if obj.signs is None else np.array(obj.signs).tolist() for obj in self.objects]
         tables["side"] = mi.Float(sum(sides, []))
-        tables["first"] = mi.UInt32(np.cumsum([0, *map(len, sides)])[placed.kind].tolist())
-        tables["step"] = mi.UInt32([int(len(sides[kind]) > 1) for kind in placed.kind])
+        tables["first"] = mi.UInt32(np.cumsum([0, *map(len, sides)])[instance_table.kind].tolist())
+        tables["step"] = mi.UInt32([int(len(sides[kind]) > 1) for kind in instance_table.kind])
         tables["fewest"] = mi.UInt32([_FEWEST[inside.orders] for inside in insides])
         tables["most"] = mi.UInt32([_MOST[inside.orders] for inside in insides])
-        tables["rounding"] = mi.Float(placed.rounding.tolist())
+        tables["rounding"] = mi.Float(instance_table.rounding.tolist())
         tables["textured"] = mi.Bool([inside.textured is not None for inside in insides])
         tables["reflects"] = mi.Bool([inside.reflection for inside in insides])
         tables["rough"] = mi.Bool([is_rough(b) for b in boundaries])
         straight = self._straight()
-        tables["straight"] = mi.Bool([straight[kind] for kind in placed.kind])
+        tables["straight"] = mi.Bool([straight[kind] for kind in instance_table.kind])
         numbers = pointer_numbers([mi.BSDFPtr(b) for b in self.boundaries])
-        tables["boundary"] = mi.UInt32([numbers[kind] for kind in placed.kind])
-        tables["kind"] = mi.UInt32(placed.kind.tolist())
+        tables["boundary"] = mi.UInt32([numbers[kind] for kind in instance_table.kind])
+        tables["kind"] = mi.UInt32(instance_table.kind.tolist())
         dr.make_opaque(tables)  # one kernel for all media
         object.__setattr__(self, "tables", tables)
         object.__setattr__(self, "any_straight", any(straight))
@@ -429,11 +439,11 @@ class WalkMedia:
 
     def place_of(self, k: mi.Int32) -> mi.UInt32 | mi.Int32:
         """Of object k in tables: the same in all lanes, which is faster, where there is one object."""
-        return mi.UInt32(0) if len(self.placed) == 1 else k
+        return mi.UInt32(0) if len(self.instance_table) == 1 else k
 
     def has_shape(self, k: mi.Int32, kind: int) -> mi.Bool:
         """Whether object k, which may be -1, has a shape of the list."""
-        if not self.placed.repeated:
+        if not self.instance_table.repeated:
             return k == kind
         return (k >= 0) & (dr.gather(mi.UInt32, self.tables["kind"], dr.maximum(k, 0)) == kind)
 
@@ -520,11 +530,11 @@ class WalkMedia:
 
     def index_of(self, si: mi.SurfaceInteraction3f, active: mi.Bool | bool = True) -> mi.Int32:
         """The number of the object that a ray has met, or -1."""
-        return self.placed.number(si, active)
+        return self.instance_table.number(si, active)
 
     def met(self, si: mi.SurfaceInteraction3f, k: mi.Int32) -> mi.Int32:
         """The number of the object whose boundary a ray inside object k has met."""
-        return k if len(self.objects) == 1 and not self.placed.repeated else self.index_of(si)
+        return k if len(self.objects) == 1 and not self.instance_table.repeated else self.index_of(si)
 
     def boundary(self, k: mi.Int32) -> mi.BSDF | mi.BSDFPtr:
         """The dielectric of object k: one BSDF, or a pointer in each lane."""
@@ -553,7 +563,7 @@ class WalkMedia:
 
         A walk that began where its ray begins would lie deeper, so that light that is scattered once were lost.
         """
-        off = clear(si.n, d, self.sight.rounding(si))
+        off = clear(si.n, d, self.instance_scene.rounding(si))
         return dr.select(inside, si.p, mi.Point3f(si.p + off)), dr.select(inside, off, 0)
 
     @property
@@ -607,9 +617,9 @@ class WalkMedia:
         if not (np.isfinite(mm_per_unit) and mm_per_unit > 0):
             raise ValueError(f"mm_per_unit must be finite and > 0, got {mm_per_unit!r}")
         shapes, shown = translucent_shapes(scene), shown_groups(scene)
-        placed, objects = Placed.of(shapes, shown), [survey(shape, scene) for shape in shapes]
-        inner = placed.scene(scene)
-        for obj, group in zip(objects, placed.groups):
+        instance_table, objects = InstanceTable.of(shapes, shown), [survey(shape, scene) for shape in shapes]
+        inner = instance_table.scene(scene)
+        for obj, group in zip(objects, instance_table.groups):
             inside = surface_of(obj.shape).inside
             if obj.lost > MOST_LOST:
                 raise ValueError(
@@ -625,7 +635,7 @@ class WalkMedia:
         wrappings = [wrapping_of(shape) for shape in shapes]
         for around, obj in zip(wrappings, objects):
             around.check(obj)
-        _check_mixes(wrappings, objects, placed, result)
+        _check_mixes(wrappings, objects, instance_table, result)
         surfaces, some = [around.surface for around in wrappings], any(a.bend or a.mixes for a in wrappings)
         return cls(
             objects,
@@ -636,7 +646,7 @@ class WalkMedia:
             result,
             tuple(wrappings) if some else (),
             tuple(shown),
-            Sight.of(scene, shown),
+            InstanceScene.of(scene, shown),
         )
 
 
@@ -659,9 +669,9 @@ def walk_media(obj: TranslucentObject) -> WalkMedia:
             values = {key: np.array([getattr(m, key) for m in obj.media]) for key in ("sigma_s", "sigma_a", "g")}
             medium = Medium(**values, eta=eta)
         inside, geometry = Inside("medium", medium, "", "total", True, obj.varying, obj.textured), obj.geometry
-        alone = Sight([], {}, bounds_of([geometry.shape]))
-        sight = alone if geometry.group is None else Sight.of_shapes([geometry.shape])
-        result = WalkMedia([geometry], [inside], geometry.scene, [_boundary(eta)], 1.0, sight=sight)
+        alone = InstanceScene([], {}, bounds_of([geometry.shape]))
+        instance_scene = alone if geometry.group is None else InstanceScene.of_shapes([geometry.shape])
+        result = WalkMedia([geometry], [inside], geometry.scene, [_boundary(eta)], 1.0, instance_scene=instance_scene)
         _OF_OBJECT[obj] = result
     return result
 
@@ -681,8 +691,8 @@ def media_within(obj: TranslucentObject) -> WalkMedia:
         boundaries = [*alone.boundaries, *(surface_of(shape).boundary for shape in shapes)]
         insides = [*alone.insides, *filter(None, contents.insides)]
         own = scene_of([obj.geometry.shape, *shapes])
-        sight = Sight([], {}, bounds_of([obj.geometry.shape, *contents.shapes]))
-        _WITHIN[obj] = WalkMedia(objects, insides, own, boundaries, 1.0, inner, sight=sight)
+        instance_scene = InstanceScene([], {}, bounds_of([obj.geometry.shape, *contents.shapes]))
+        _WITHIN[obj] = WalkMedia(objects, insides, own, boundaries, 1.0, inner, instance_scene=instance_scene)
     return _WITHIN[obj]
 
 

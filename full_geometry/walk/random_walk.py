@@ -270,7 +270,7 @@ class Walker:
     ) -> tuple[Walk, Record]:
         """Reflection at the boundary seen from inside, or the way out."""
         media, k = self.media, walk.object
-        si = media.sight.interaction(hit, ray, media.needed)
+        si = media.instance_scene.interaction(hit, ray, media.needed)
         met = media.met(si, k)
         si = media.seen(si, k, ray.d)
         # the flight goes on behind an object that overlaps, and behind the own boundary if rounding has put it outside
@@ -296,7 +296,7 @@ class Walker:
     ) -> tuple[Walk, Record]:
         """The same where something lies inside: reflection or refraction at any surface, into what is on that side."""
         media, inner, k = self.media, self.media.inner, walk.object
-        si = media.sight.interaction(hit, ray, mi.RayFlags.All)
+        si = media.instance_scene.interaction(hit, ray, mi.RayFlags.All)
         met, around = media.index_of(si, si.is_valid()), inner.around(si)
         own, nested, plain = met == k, (met >= 0) & (met != k), met < 0
         si = media.seen(si, met, ray.d)

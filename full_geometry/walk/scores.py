@@ -189,9 +189,9 @@ class PathScores:
     def of(cls, media: WalkMedia, paths: int) -> PathScores:
         """For so many paths."""
         numbers = [k for k, _ in followed(media)]
-        rows = mi.Int32([numbers.index(k) if k in numbers else -1 for k in media.placed.kind])
+        rows = mi.Int32([numbers.index(k) if k in numbers else -1 for k in media.instance_table.kind])
         room, textured = paths * len(numbers), followed_textures(media)
-        painted = mi.Bool([k in textured for k in media.placed.kind])
+        painted = mi.Bool([k in textured for k in media.instance_table.kind])
         kept = KeptStays.of(paths) if textured else None
         result = cls(paths, rows, Score.sums(room), Score.zeros(room), kept, painted)
         dr.eval(result.p, result.q, rows, painted)

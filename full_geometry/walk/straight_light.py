@@ -105,7 +105,7 @@ class StraightLight:
             ray = mi.Ray3f(way.ray)
             first = way.inside & (way.length == 0)
             ray.maxt = dr.select(first, dr.minimum(reach, way.left), way.left)
-            si = media.sight.intersect(self.scene, ray, mi.RayFlags.Minimal, active=way.going)
+            si = media.instance_scene.intersect(self.scene, ray, mi.RayFlags.Minimal, active=way.going)
             hit = si.is_valid()
             own = hit & (media.index_of(si, hit) == k)
             leaves = dr.dot(si.n, ray.d) * media.side(k, si.prim_index) > 0
@@ -118,7 +118,7 @@ class StraightLight:
                             way.length + dr.select(passed, si.t, 0), dr.select(passed, way.T * T, way.T),
                             way.rng)  # fmt: skip
 
-        left = ds.dist - before(ds.p, ds.dist, media.sight.rounding_of(ds.emitter))
+        left = ds.dist - before(ds.p, ds.dist, media.instance_scene.rounding_of(ds.emitter))
         start = LightWay(ray_of(event.p, ds.d, medium), left, mi.Bool(True) | active, mi.Bool(active),
                          ~active & active, dr.zeros(mi.Float, dr.width(event.p)), mi.Spectrum(1), rng)  # fmt: skip
         return dr.while_loop((start,), lambda way: way.going, lambda way: (go(way),), label="way to an emitter")[0]

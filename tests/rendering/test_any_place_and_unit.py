@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from full_geometry.geometry.instances import Sight, bounds_of
+from full_geometry.geometry.instances import InstanceScene, bounds_of
 from full_geometry.geometry.rounding import ray_from
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -122,7 +122,7 @@ def test_rays_that_begin_on_a_surface_do_not_meet_it_there(kind: str, frame: Fra
     start = 0.5 * (low + high) + 0.6 * size * from_
     d = 0.5 * (low + high) + 0.4 * size * to * rng.random(n) ** (1 / 3) - start
     si = scene.ray_intersect(mi.Ray3f(mi.Point3f(start), mi.Vector3f(d / np.linalg.norm(d, axis=0))))
-    ray = ray_from(si, mi.Vector3f(along), Sight([], {}, bounds_of(scene.shapes())).rounding(si))
+    ray = ray_from(si, mi.Vector3f(along), InstanceScene([], {}, bounds_of(scene.shapes())).rounding(si))
     again = scene.ray_intersect(ray, mi.RayFlags.All, False, si.is_valid())
     wrong = again.is_valid() & (again.t < 1e-2 * size) & (dr.dot(si.n, ray.d) * dr.dot(again.n, ray.d) > 0)
     assert dr.mean(dr.select(si.is_valid(), 1.0, 0.0))[0] > 0.2

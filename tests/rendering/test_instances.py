@@ -12,7 +12,7 @@ from rendered import surface
 mi = pytest.importorskip("mitsuba")
 dr = pytest.importorskip("drjit")
 
-from full_geometry.geometry.instances import Placed, Sight, shapes_of, shown_groups  # noqa: E402
+from full_geometry.geometry.instances import InstanceScene, InstanceTable, shapes_of, shown_groups  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -144,7 +144,7 @@ def test_a_hit_on_an_instance_is_what_mitsuba_makes_of_it() -> None:
     d /= np.linalg.norm(d, axis=0)
     ray = mi.Ray3f(mi.Point3f(3, 0, 8), mi.Vector3f(d))
     flags = mi.RayFlags.All | mi.RayFlags.dNSdUV
-    own = Sight.of(scene, shown_groups(scene)).intersect(scene, ray, flags)
+    own = InstanceScene.of(scene, shown_groups(scene)).intersect(scene, ray, flags)
     theirs = scene.ray_intersect(ray, flags, False)
     hit = np.array(theirs.is_valid())
     assert (hit == np.array(own.is_valid())).all() and 0.3 < hit.mean() < 0.95
@@ -160,10 +160,12 @@ def test_each_shape_of_each_instance_has_a_number_of_its_own() -> None:
     wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -3]).scale(9)}
     scene = mi.load_dict(view(**shown(parts, places()), wall=wall))
     groups = shown_groups(scene)
-    placed = Placed.of(shapes_of(scene, groups), groups)
+    instance_table = InstanceTable.of(shapes_of(scene, groups), groups)
     ray = mi.Ray3f(mi.Point3f([-1.3, 1.3, 0], [0.1, 0.1, 4], [8, 8, 8]), mi.Vector3f(0, 0, -1))
-    number = np.array(placed.number(scene.ray_intersect(ray)))
-    assert len(placed) == 5 and [placed.shapes[placed.kind[k]].id() for k in number[2:]] == ["wall"]
+    number = np.array(instance_table.number(scene.ray_intersect(ray)))
+    assert len(instance_table) == 5 and [instance_table.shapes[instance_table.kind[k]].id() for k in number[2:]] == [
+        "wall"
+    ]
     assert abs(int(number[1]) - int(number[0])) == 1  # two instances of one shape
 
 
@@ -319,7 +321,7 @@ def test_a_lamp_in_one_instance_is_a_light_of_that_alone() -> None:
     scene = mi.load_dict(view(**lamp, **shown({"box": box()}, places())))
     media = scene.integrator().tracer(scene).visitor.media
     ((_, k),) = media.inner.lights
-    assert np.allclose(media.placed.to_world(0)[k, :3, 3], [1.3, 0.1, 0.0])
+    assert np.allclose(media.instance_table.to_world(0)[k, :3, 3], [1.3, 0.1, 0.0])
 
 
 def test_a_medium_that_varies_in_space_is_refused_in_a_group() -> None:
