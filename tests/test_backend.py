@@ -17,7 +17,7 @@ from halfspace_sss import backend
 
 OLD = "import drjit as dr\ndr.detail.llvm_version = lambda: (15, 0, 7)\n"
 REFUSED = "Dr.Jit found LLVM 15.0.7 when it was imported, but it needs LLVM 17 or newer: import halfspace_sss"
-REGISTER = "import mitsuba as mi\nmi.set_variant('llvm_ad_rgb')\nimport full_geometry\nrendering.register()"
+REGISTER = "import mitsuba as mi\nmi.set_variant('llvm_ad_rgb')\nimport full_geometry\nfull_geometry.register()"
 QUERY = "1.0, 0.9, 0.0, 0.8, 0.5"
 USES = {
     "register": REGISTER,
@@ -102,7 +102,7 @@ def test_an_old_llvm_that_the_user_set_is_told_from_a_damaged_one() -> None:
 @pytest.mark.parametrize(
     "use",
     [
-        "import full_geometry\nrendering.register()\nimport mitsuba as mi\n"
+        "import full_geometry\nfull_geometry.register()\nimport mitsuba as mi\n"
         "mi.Bitmap(image).write('a.exr')\nassert np.array_equal(np.array(mi.Bitmap('a.exr')), image)",
         "from figures.parts.store import exr_bytes, read_exr\n"
         "open('a.exr', 'wb').write(exr_bytes(image, 'a', 'test'))\nassert np.array_equal(read_exr('a.exr'), image)",

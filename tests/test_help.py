@@ -11,10 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import full_geometry
 import halfspace_sss
 from halfspace_sss.materials.files import parse
 
-NAMES = [found.name for found in pkgutil.walk_packages(halfspace_sss.__path__, "halfspace_sss.")]
+NAMES = [
+    found.name
+    for package in (halfspace_sss, full_geometry)
+    for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
+]
 HELP = {name: textwrap.dedent(importlib.import_module(name).__doc__ or "") for name in NAMES}
 XML = [
     block

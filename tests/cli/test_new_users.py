@@ -48,7 +48,7 @@ def test_a_terminal_without_unicode_shows_every_table() -> None:
 
 def test_help_of_the_surface_works_before_it_is_registered() -> None:
     pytest.importorskip("mitsuba")
-    code = "import halfspace_sss; import full_geometry; help(full_geometry.surface.translucent)"
+    code = "import full_geometry.surface.translucent as t; help(t)"
     assert b"The Mitsuba surface `translucent`" in _run(program=("-c", code)).stdout
 
 

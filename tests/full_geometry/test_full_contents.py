@@ -24,10 +24,10 @@ from full_geometry.learning import object_learner as command  # noqa: E402
 from full_geometry.learning.model_errors import EVEN_SKY, errors_of  # noqa: E402
 from full_geometry.learning.network_fitting import Recipe  # noqa: E402
 from full_geometry.learning.training import Trained, train  # noqa: E402
-from full_geometry.objects import objects  # noqa: E402
 from full_geometry.objects.objects import object_of  # noqa: E402
 from full_geometry.scenes.mitsuba_scene import medium, with_media  # noqa: E402
 from full_geometry.trade import assess  # noqa: E402
+from full_geometry.transport import prepare  # noqa: E402
 from full_geometry.transport.exit_pairs import trace_exits  # noqa: E402
 from full_geometry.transport.features import first_event  # noqa: E402
 from full_geometry.transport.half_space import half_space_model  # noqa: E402
@@ -142,7 +142,7 @@ def test_orders_below_two_of_images_are_those_of_walks_that_meet_nothing_inside(
         found = half_space_model("better_dipole", obj.geometry, obj.media, settings)
         return ObjectModel(Nothing(), found.proposals)
 
-    monkeypatch.setattr(objects, "_model_of", nothing)
+    monkeypatch.setattr(prepare, "_model_of", nothing)
     loaded = mi.load_dict(scene(INSIDE["second medium"](), light=LIGHTING[light], unit=1.0))
     ends = trace_exits(object_of(loaded, None), seen(loaded, 8192), (5,), fewest=0, most=1)
     lit = mi.Spectrum(1)

@@ -13,8 +13,7 @@ from test_translucent_walk import COLOURED, _agree, _lamp, _runs, _scene, _small
 
 from full_geometry.geometry.points import ObjectModel
 from full_geometry.integrators import low_orders
-from full_geometry.objects import objects
-from full_geometry.transport import half_space
+from full_geometry.transport import half_space, prepare
 from full_geometry.walk import media as walks
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -29,7 +28,7 @@ DARK = {"sigma_s": "0.02,0.05,0.1", "sigma_a": "0.2,0.1,0.02", "g": -0.2, "eta":
 @pytest.fixture
 def only_few(monkeypatch: pytest.MonkeyPatch) -> None:
     """No order from two on: neither in walks nor by a model."""
-    monkeypatch.setattr(objects, "_model_of", lambda *_: ObjectModel(None, None))
+    monkeypatch.setattr(prepare, "_model_of", lambda *_: ObjectModel(None, None))
     monkeypatch.setitem(walks._MOST, "total", 1)
     monkeypatch.setattr(half_space, "MOST_STRAIGHT", 1.0)  # no model has to know what passes
 

@@ -16,8 +16,8 @@ from rendered import surface  # noqa: E402
 
 from full_geometry.geometry.points import ObjectModel  # noqa: E402
 from full_geometry.integrators.lighting import Lights, Sky  # noqa: E402
-from full_geometry.objects import objects  # noqa: E402
 from full_geometry.registry import ModelEntry  # noqa: E402
+from full_geometry.transport import prepare  # noqa: E402
 from full_geometry.transport.half_space import half_space_model  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -78,7 +78,7 @@ def scene(kind: type, patch: pytest.MonkeyPatch, light: dict, **integrator) -> d
         proposals = half_space_model("better_dipole", obj.geometry, obj.media, settings).proposals
         return ObjectModel(kind(obj.geometry.area), proposals, 2)
 
-    patch.setattr(objects, "_model_of", means)
+    patch.setattr(prepare, "_model_of", means)
     patch.setattr(ModelEntry, "knows_objects", True)
     film = {"type": "hdrfilm", "width": 12, "height": 12, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
     view = mi.ScalarTransform4f().look_at([0, 1, 5], [0, 0, 0], [0, 1, 0]).scale(0.6)
