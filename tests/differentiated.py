@@ -113,8 +113,8 @@ class Shifted:
     """Stands in for the `Variation` of a body: coefficients of another medium along paths of this one."""
 
     def __init__(self, body, name: str, h: float, only: int | None) -> None:
-        self.inside, self.model, self.media = body.variation.inside, body.variation.model, []
-        for k, m in enumerate(self.inside.channels()):
+        self.spec, self.model, self.media = body.variation.spec, body.variation.model, []
+        for k, m in enumerate(self.spec.channels()):
             ratios = {key: float(getattr(m, key)) for key in ("albedo", "sigma_t", "g")}
             ratios[name] += h if only in (None, k) else 0.0
             self.media.append(Medium.from_albedo(**ratios, eta=m.eta))
@@ -126,11 +126,11 @@ class Shifted:
         """That of the other medium."""
         if own is None:
             return None
-        if self.inside.model not in UNTRAINED:
+        if self.spec.model not in UNTRAINED:
             return own.transport.beside(self.media)
         models = []  # by the scaling law, so that the stand-ins keep their weights
-        for c, m in zip(self.inside.channels(), self.media):
-            one, s = bssrdf(self.inside.model, c.in_mfp()), float(m.sigma_t)
+        for c, m in zip(self.spec.channels(), self.media):
+            one, s = bssrdf(self.spec.model, c.in_mfp()), float(m.sigma_t)
             models.append(type(one)(Medium(one.medium.sigma_s * s, one.medium.sigma_a * s, m.g, m.eta)))
         return dataclasses.replace(own.transport, models=models)
 

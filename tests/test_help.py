@@ -50,7 +50,7 @@ def test_a_piece_of_xml_loads(mi, block: str, tmp_path: Path, monkeypatch: pytes
     monkeypatch.chdir(tmp_path)
     scene = mi.load_string(f'<scene version="3.0.0"><shape type="sphere">{block}</shape></scene>')
     label = "medium" if "wax.vol" in block else "marble"
-    assert f"Translucent[Inside(label='{label}'" in str(scene.shapes()[0].bsdf())
+    assert f"Translucent[MediumSpec(label='{label}'" in str(scene.shapes()[0].bsdf())
 
 
 @pytest.mark.parametrize("line", DICTS)

@@ -372,7 +372,7 @@ def choose_event(obj: TranslucentObject, si: mi.SurfaceInteraction3f, active: mi
     valid = active & (mu > 0) & (dr.dot(d, out.n) < 0)
 
     # ---- probabilities
-    reflection = dr.clip(F, LEAST_REFLECTION, 0.95) if obj.surface.inside.reflection else mi.Float(0)
+    reflection = dr.clip(F, LEAST_REFLECTION, 0.95) if obj.surface.spec.reflection else mi.Float(0)
     if not obj.low_orders:
         return EventChoice(reflection, mi.Float(0), RefractedRay(out, d, 1 - F, valid, mi.Float(0)))
     T = _transmittance(obj, out, d, valid)
@@ -480,7 +480,7 @@ def _scatter_outside(
     for obj, here, choice in choices:
         inside |= here
         reflection = dr.select(here, choice.reflection, reflection)
-        if obj.surface.inside.reflection:
+        if obj.surface.spec.reflection:
             glossy |= here & ~at.low_only
     plain = at.active & ~inside
     if any(obj.wrapping.mixes for obj in context.objects):

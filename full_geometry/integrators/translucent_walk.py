@@ -228,7 +228,7 @@ def _prepared(scene: mi.Scene, before: tuple, mm_per_unit: float) -> tuple[Scene
         return before
     media = WalkMedia.of(scene, mm_per_unit)
     check_sensors(scene, media.objects)
-    for each, inside in zip(media.objects, media.insides):
+    for each, inside in zip(media.objects, media.specs):
         known = equivalent(inside, each) if inside.textured else inside
         check_size(each, [mm_per_unit * float(m.sigma_t) for m in known.channels()], mm_per_unit)
     return mark, shapes, places, media
@@ -256,7 +256,7 @@ def _check_followed(scene: mi.Scene) -> None:
     """
     parameters, owners, attributes = mi.traverse(scene), [], set()
     for shape in translucent_shapes(scene):
-        textured = surface_of(shape).inside.textured
+        textured = surface_of(shape).spec.textured
         owners.append(surface_of(shape))
         for texture in textured.textures.values() if textured else ():
             owners += mi.traverse(texture).hierarchy
@@ -276,7 +276,7 @@ def _render(
     tracer: PathTracer, sensor: mi.Sensor, seed: int, spp: int, keep: Keep | None, scored: bool = False
 ) -> None:
     """Fill the film of a sensor, in launches between which an interrupt is heard."""
-    for obj, inside in zip(tracer.visitor.media.objects, tracer.visitor.media.insides):
+    for obj, inside in zip(tracer.visitor.media.objects, tracer.visitor.media.specs):
         if inside.spectral is not None:
             inside.spectral.check_covers(obj.name, sensor)
     sensor.film().prepare(LAYER if tracer.layers else [])

@@ -86,7 +86,7 @@ def fit(
     mm_per_unit = scene.integrator().mm_per_unit
     check_views(scene, images, shape)
     work = None if work is None else check_folder(work)
-    comparison, textured = ViewComparison(scene, list(images), settings), surface_of(shape).inside.textured is not None
+    comparison, textured = ViewComparison(scene, list(images), settings), surface_of(shape).spec.textured is not None
     if textured:
         from full_geometry.inverse.textures import TextureDescent, TextureParameters  # scipy
 
@@ -279,7 +279,7 @@ class MediumDescent:
             at += len(value)
         off = chi_square.told() + self._brightness(chi_square.near)
         told = off + self.parameters.at_bounds(x) + _ambiguity(values, correlation)
-        medium, exposures = surface_of(self.parameters.shape).inside.medium, self.comparison.exposures.tolist()
+        medium, exposures = surface_of(self.parameters.shape).spec.medium, self.comparison.exposures.tolist()
         return MaterialFit(
             values, errors, correlation, medium, fitted, test, chi_square, exposures, bool(off), told,
             self.steps, views,

@@ -53,12 +53,12 @@ def check_derivatives(integrator: mi.Integrator, shape: mi.Shape, names: Sequenc
         raise ValueError(f"integrator must be translucent_walk or bssrdf, got {integrator.class_name()}")
     if not is_bssrdf(integrator):
         return
-    settings, inside = integrator.settings, surface_of(shape).inside
+    settings, spec = integrator.settings, surface_of(shape).spec
     if settings.light != "sampled":
         raise ValueError(f"light must be sampled to fit a medium, got {settings.light}")
-    model = settings.model or inside.model
-    if inside.textured is not None:
-        made = bssrdf(model, inside.channels()[0]) if lookup(model).of_half_space else None
+    model = settings.model or spec.model
+    if spec.textured is not None:
+        made = bssrdf(model, spec.channels()[0]) if lookup(model).of_half_space else None
         if made is None or (made.checksums and not isinstance(made, Neural)):
             raise ValueError(
                 f"model must have derivatives by textures, got {model!r}: analytic models and neural have them"
@@ -111,7 +111,7 @@ class FitParameters:
             ValueError: a name is unknown or there twice, sigma_t and mfp are both asked for, or the medium varies.
         """
         check_names(names, NAMES)
-        if not surface_of(shape).inside.is_homogeneous:
+        if not surface_of(shape).spec.is_homogeneous:
             raise ValueError(f"the medium of {name_of(shape)} must be homogeneous to be fitted, got one that varies")
         return cls(tuple(names), shape, size_bounds(shape, mm_per_unit))
 

@@ -235,7 +235,7 @@ class TextureParameters:
             ValueError: a name is unknown, there twice, or of another medium than the object's; a texture is neither a
                 bitmap nor an attribute of the mesh.
         """
-        textured = surface_of(shape).inside.textured
+        textured = surface_of(shape).spec.textured
         constants = [name for name in textured.constants if name != "sigma_t"]
         lengths = ["sigma_t", "mfp"] if "sigma_t" in textured.constants else []
         check_names(names, (*textured.textures, *constants, *lengths))
@@ -461,7 +461,7 @@ class TextureDescent:
         self.scene_parameters.update()
         surface = surface_of(self.parameters.shape)
         textures = {FIELDS.get(v.name, v.name): followed[v.name] for v in self.variables if v.is_texture}
-        surface.inside = surface.inside.with_variables(surface, **textures)
+        surface.spec = surface.spec.with_variables(surface, **textures)
 
     def _followed(self) -> dict[str, Any]:
         """Constants, and an even change of each texture."""
@@ -557,7 +557,7 @@ class TextureDescent:
             [{name: each[j] for name, each in found.items() if each[0] == kind} for j in (1, 2)]
             for kind in (False, True)
         )
-        medium = surface_of(self.parameters.shape).inside
+        medium = surface_of(self.parameters.shape).spec
         medium = medium.textured.mean(medium.medium.g, medium.medium.eta, self.parameters.shape)
         exposures = self.comparison.exposures.tolist()
         return MaterialFit(
@@ -609,7 +609,7 @@ def painted_mesh(scene: str | Path, name: str | None, values: Mapping[str, tuple
     shape = translucent_object(open_scene(scene, PATH_TRACED), name)
     parameters, stream = mi.traverse(shape), mi.MemoryStream()
     for key, (each, errors) in values.items():
-        attribute = shown(surface_of(shape).inside.textured.textures[key])[0][1]
+        attribute = shown(surface_of(shape).spec.textured.textures[key])[0][1]
         parameters[attribute] = mi.Float(each.ravel().tolist())
         shape.add_attribute(f"{attribute}_error", errors.shape[-1], errors.ravel().tolist())
     parameters.update()

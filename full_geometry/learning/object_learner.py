@@ -28,9 +28,9 @@ def untrained(scene: Any) -> list[str]:
     """
     missing = []
     for shape in outermost(scene) if find_spec("torch") else ():
-        inside = surface_of(shape).inside
-        asked = inside.model == KIND and inside.orders != "single"
-        if not asked or not np.any(inside.medium.sigma_s > 0):
+        spec = surface_of(shape).spec
+        asked = spec.model == KIND and spec.orders != "single"
+        if not asked or not np.any(spec.medium.sigma_s > 0):
             continue
         obj = object_of(scene, None, None, shape.id())
         if not trained(obj):

@@ -51,7 +51,7 @@ from full_geometry.objects.inclusions import Content, contents, place_of
 from full_geometry.registry import lookup
 from full_geometry.surface.spectral import MediumByWavelength
 from full_geometry.surface.textured import SurfaceMedium, TexturedMedium
-from full_geometry.surface.translucent import Inside, check_boundary
+from full_geometry.surface.translucent import MediumSpec, check_boundary
 from full_geometry.surface.variation import Variation
 from full_geometry.surface.varying import VaryingMedium, equivalent
 from full_geometry.surface.wrapped import Wrapping, surface_of, wrapping_of
@@ -68,13 +68,13 @@ class Contents:
     Args:
         found: shapes that neither emit nor reach out of the object, those inside each other too.
         scene: a scene that holds these only.
-        insides: of each what is below its surface, 1/(scene unit); None where that is not translucent.
+        specs: the `MediumSpec` of each, 1/(scene unit); None of a surface that is not translucent.
         surfaces: of each the BSDF as it is.
     """
 
     found: list[Content]
     scene: mi.Scene
-    insides: list[Inside | None]
+    specs: list[MediumSpec | None]
     surfaces: list[Snapshot]
 
     @classmethod
@@ -82,9 +82,9 @@ class Contents:
         """Of shapes in the scene `world`."""
         shapes = [content.thing for content in result]
         surfaces = [surface_of(shape) for shape in shapes]
-        below = [surface and surface.inside for surface in surfaces]
-        insides = [inside and replace(inside, medium=inside.medium.scaled(mm_per_unit)) for inside in below]
-        return cls(result, scene_of(shapes, world), insides, [Snapshot.of(shape.bsdf()) for shape in shapes])
+        below = [surface and surface.spec for surface in surfaces]
+        specs = [spec and replace(spec, medium=spec.medium.scaled(mm_per_unit)) for spec in below]
+        return cls(result, scene_of(shapes, world), specs, [Snapshot.of(shape.bsdf()) for shape in shapes])
 
     @property
     def shapes(self) -> list[mi.Shape]:
@@ -130,8 +130,8 @@ def filled(scene: mi.Scene, objects: list[Geometry], mm_per_unit: float, what: s
             refuse(content, holder, what)
     held = [[content for content in result if kinds[content.object] == k] for k in range(len(objects))]
     return [
-        replace(obj, contents=Contents.of(inside, scene, mm_per_unit)) if inside else obj
-        for obj, inside in zip(objects, held)
+        replace(obj, contents=Contents.of(spec, scene, mm_per_unit)) if spec else obj
+        for obj, spec in zip(objects, held)
         if not any(obj.shape is content.thing for content in result)
     ]
 
@@ -357,18 +357,18 @@ class TranslucentObject:
         with dr.resume_grad():
             if self.textured.is_followed(self.geometry.shape):
                 raise ValueError(
-                    f"textures must not have gradients enabled under {self.surface.inside.model!r}, got some of object "
+                    f"textures must not have gradients enabled under {self.surface.spec.model!r}, got some of object "
                     f"{self.geometry.name}: models of the half-space have derivatives by them"
                 )
 
     def is_current(self) -> bool:
         """Whether the object still has the shape and the medium that it was made of."""
-        textured, shape = self.surface.inside.textured, self.geometry.shape
+        textured, shape = self.surface.spec.textured, self.geometry.shape
         same = textured is None or self.painted == Snapshot.of(shape)
         if textured is not None and self.textured is None:  # its textures are the same everywhere
             with dr.resume_grad():
                 same = same and not textured.is_followed(shape)
-        return same and self.surface.inside is self.variation.inside and self.geometry.is_current()
+        return same and self.surface.spec is self.variation.spec and self.geometry.is_current()
 
 
 def surveyed(shape: mi.Shape, scene: mi.Scene, groups: Sequence[Group]) -> Geometry:
@@ -473,14 +473,14 @@ def object_of(
     unit = millimetres(shape) if mm_per_unit is None else mm_per_unit
     geometry = surveyed(_object_of(shape, name), shape, shown_groups(shape))
     (geometry,) = filled(shape, [geometry], unit, "learning")
-    inside = equivalent(surface_of(geometry.shape).inside, geometry)
-    media = _in_scene_units(inside.medium, unit)
+    spec = equivalent(surface_of(geometry.shape).spec, geometry)
+    media = _in_scene_units(spec.medium, unit)
     check_geometry(geometry)
     check_size(geometry, [float(m.sigma_t) for m in media], unit)
-    if inside.textured is not None:
-        inside.textured.check(geometry)
-        inside = replace(inside, textured=None) if inside.textured.is_even(geometry.shape) else inside
-    varying, textured = (part if part is None else part.scaled(unit) for part in (inside.varying, inside.textured))
+    if spec.textured is not None:
+        spec.textured.check(geometry)
+        spec = replace(spec, textured=None) if spec.textured.is_even(geometry.shape) else spec
+    varying, textured = (part if part is None else part.scaled(unit) for part in (spec.varying, spec.textured))
     return TranslucentObject(geometry, media, varying, textured)
 
 
@@ -512,7 +512,7 @@ _DELTAS = int(mi.BSDFFlags.Delta) | int(mi.BSDFFlags.GlossyTransmission)  # of B
 
 def _check_contents(name: str, contents: Contents) -> None:
     """ValueError if something inside an object cannot be learnt: light that it mirrors or refracts is a delta in S."""
-    for content, inside in zip(contents.found, contents.insides):
+    for content, spec in zip(contents.found, contents.specs):
         shape = content.thing
         if content.shown:
             raise ValueError(f"what lies inside {name} must be no instance to be learnt, got {content.name}")
@@ -521,12 +521,12 @@ def _check_contents(name: str, contents: Contents) -> None:
                 f"what lies inside {name} must be a mesh or have a transformation to be learnt, got the "
                 f"{shape.class_name()} {name_of(shape)}"
             )
-        if inside is None and shape.bsdf().flags() & _DELTAS:
+        if spec is None and shape.bsdf().flags() & _DELTAS:
             raise ValueError(
                 f"what lies inside {name} must be opaque and no mirror, or translucent, to be learnt, as S holds no "
                 f"deltas, got the shape {name_of(shape)} with a {shape.bsdf().class_name()}"
             )
-        if inside is not None and not inside.is_homogeneous:
+        if spec is not None and not spec.is_homogeneous:
             raise ValueError(f"media inside {name} must be homogeneous to be learnt, got that of {name_of(shape)}")
 
 

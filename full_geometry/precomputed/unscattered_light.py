@@ -115,7 +115,7 @@ def unscattered_light(
         cells: of the objects, from `inside_cells_of`.
         rays: of light, for each object.
     """
-    directional = any(np.any(inside.medium.g) for inside in media.insides)
+    directional = any(np.any(inside.medium.g) for inside in media.specs)
     slots, values, lobes, first = [], [], [], 0
     rows = {"first": [], "low": [], "scale": [], "counts": []}
     start = 0
@@ -159,10 +159,10 @@ def obstacle(media: WalkMedia) -> str:
     if media.inner is not None:
         return "something lies inside an object"
     for k, kind in enumerate(media.instance_table.kind):
-        h = _edges(media, k, EDGE)[1] * media.mm_per_unit * float(np.mean(media.insides[kind].medium.sigma_t))
+        h = _edges(media, k, EDGE)[1] * media.mm_per_unit * float(np.mean(media.specs[kind].medium.sigma_t))
         if h > MOST_EDGE:
             return f"object {media.objects[kind].name} is so many mean free paths wide that cells have {h:.2g}"
-    for obj, inside, around in zip_longest(media.objects, media.insides, media.wrappings):
+    for obj, inside, around in zip_longest(media.objects, media.specs, media.wrappings):
         if not obj.closed:
             return f"object {obj.name} is not closed"
         if inside.textured is not None and "sigma_t" not in inside.textured.constants:
@@ -180,7 +180,7 @@ def inside_cells_of(media: WalkMedia, edge: float = EDGE) -> list[InsideCells]:
     """The cells of all objects, `edge` mean free paths wide."""
     results = []
     for k, kind in enumerate(media.instance_table.kind):
-        sigma_t = media.mm_per_unit * np.atleast_1d(media.insides[kind].medium.sigma_t)
+        sigma_t = media.mm_per_unit * np.atleast_1d(media.specs[kind].medium.sigma_t)
         box, h = _edges(media, k, edge)
         depth = np.inf if media.varies else DEPTH / float(np.min(sigma_t))
         area = float(
@@ -196,7 +196,7 @@ def _edges(media: WalkMedia, k: int, edge: float) -> tuple[tuple[np.ndarray, np.
     """The box of object k, and the edge of its cells, scene units."""
     kind = media.instance_table.kind[k]
     low, high = ends_of(corners(media.objects[kind].scene.bbox(), _to_world(media, k)[None]))
-    sigma_t = media.mm_per_unit * float(np.mean(media.insides[kind].medium.sigma_t))
+    sigma_t = media.mm_per_unit * float(np.mean(media.specs[kind].medium.sigma_t))
     return (low[0], high[0]), grid_edge((low[0], high[0]), edge / sigma_t)
 
 

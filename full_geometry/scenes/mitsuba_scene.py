@@ -64,10 +64,10 @@ def _fill(config: Any, state: Any, shape: Any, mm_per_unit: float) -> None:
         if state.nodes[index].props.plugin_name() != "translucent":
             continue
         surface = _instance(config, state, index)
-        eta = float(surface.inside.medium.eta)
+        eta = float(surface.spec.medium.eta)
         plain = {"type": "null"} if eta == 1 else {"type": "dielectric", "int_ior": eta, "ext_ior": 1.0}
         shape[key] = mi.load_dict(plain) if is_smooth_boundary(surface.boundary) else surface.boundary
-        shape["interior"] = medium(surface.inside, mm_per_unit)
+        shape["interior"] = medium(surface.spec, mm_per_unit)
         return
 
 
@@ -94,22 +94,22 @@ def _replace_integrator(state: Any, integrator: dict) -> None:
 _OURS = ("bssrdf", "translucent_walk")
 
 
-def medium(inside: Any, mm_per_unit: float) -> Any:
-    """The `homogeneous` or `heterogeneous` medium of an inside."""
-    if inside.orders != "total" or not inside.reflection:
+def medium(spec: Any, mm_per_unit: float) -> Any:
+    """The `homogeneous` or `heterogeneous` medium of a `MediumSpec`."""
+    if spec.orders != "total" or not spec.reflection:
         raise ValueError(
-            f"orders must be 'total', with reflection, for Mitsuba's media, got {inside.orders!r} and "
-            f"reflection {inside.reflection} for {inside.label}"
+            f"orders must be 'total', with reflection, for Mitsuba's media, got {spec.orders!r} and "
+            f"reflection {spec.reflection} for {spec.label}"
         )
-    m = inside.medium
+    m = spec.medium
     if np.ptp(m.g) > 0:
-        raise ValueError(f"g must be the same in all channels for Mitsuba's media, got {m.g} for {inside.label}")
+        raise ValueError(f"g must be the same in all channels for Mitsuba's media, got {m.g} for {spec.label}")
     g = float(np.max(m.g))
     phase = {"type": "hg", "g": g} if g else {"type": "isotropic"}
-    if inside.textured is not None:
-        raise ValueError(f"media must be without textures for Mitsuba's media, got those of {inside.label}")
-    if inside.varying is not None:
-        return mi.load_dict({"type": "heterogeneous", **_volumes(inside.varying, mm_per_unit), "phase": phase})
+    if spec.textured is not None:
+        raise ValueError(f"media must be without textures for Mitsuba's media, got those of {spec.label}")
+    if spec.varying is not None:
+        return mi.load_dict({"type": "heterogeneous", **_volumes(spec.varying, mm_per_unit), "phase": phase})
     scale = float(np.max(m.sigma_t))  # Mitsuba takes colours up to one
     albedo, sigma_t = (np.atleast_1d(v).tolist() for v in (m.albedo, m.sigma_t / scale))
     values = (

@@ -46,8 +46,8 @@ def untrained(scene: Any) -> dict[str, list[str]]:
     """
     if not is_bssrdf(scene.integrator()) or scene.integrator().settings.train_seconds == 0:
         return {}
-    insides = [surface_of(shape).inside for shape in translucent_shapes(scene)]
-    names, known, results = sorted({inside.model for inside in insides}), learners(), {}
+    specs = [surface_of(shape).spec for shape in translucent_shapes(scene)]
+    names, known, results = sorted({spec.model for spec in specs}), learners(), {}
     for name in names:
         if name in known and (ids := known[name].untrained(scene)):
             results[name] = ids
@@ -159,7 +159,7 @@ def _join(scene: Any) -> bool:
     shapes, own = outermost(scene), scene.shapes()
     alone = all(any(shape is each for each in own) for shape in shapes)
     around = map(wrapping_of, shapes)
-    learnt = alone and all(each.surface.inside.model in learners() and not each.mixes for each in around)
+    learnt = alone and all(each.surface.spec.model in learners() and not each.mixes for each in around)
     return scene.integrator().settings.max_depth != 1 and learnt
 
 

@@ -262,7 +262,7 @@ def chosen(scene: Any, integrator: Any) -> dict[str, Any]:
     """What was chosen for "auto" and why; it is chosen now if it has not been."""
     if not is_bssrdf(integrator):
         return {}
-    models = [surface.inside.model for surface in map(surface_of, translucent_shapes(scene))]
+    models = [surface.spec.model for surface in map(surface_of, translucent_shapes(scene))]
     if AUTO not in (integrator.settings.model, integrator.settings.light, *models):
         return {}
     integrator.prepare(scene)

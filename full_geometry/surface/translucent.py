@@ -274,7 +274,7 @@ def translucent_class() -> type:
 
 
 def is_translucent(bsdf: mi.BSDF | None) -> bool:
-    """Whether a BSDF is a `translucent` surface, and so has an `inside`."""
+    """Whether a BSDF is a `translucent` surface, with a `MediumSpec` as its `spec`."""
     return isinstance(bsdf, translucent_class())
 
 
@@ -283,40 +283,40 @@ def _class(variant: str) -> type:
     """The class of a variant, which must be the current one."""
 
     class Translucent(mi.BSDF):
-        """The reflection of the boundary as a BSDF, with an `inside`."""
+        """The reflection of the boundary as a BSDF; `spec` says what is below."""
 
         def __init__(self, props: mi.Properties) -> None:
             mi.BSDF.__init__(self, props)
             check_parameters("translucent", props, (*PARAMETERS, *(key for key, _ in _boundaries(props))))
-            self.inside = read_inside(props)
-            self.boundary = boundary_of([inner for _, inner in _boundaries(props)], self.inside.medium.eta)
+            self.spec = read_medium_spec(props)
+            self.boundary = boundary_of([inner for _, inner in _boundaries(props)], self.spec.medium.eta)
             self.reflection = Reflection.of(self.boundary)
             self.m_components = [self.boundary.flags(self.reflection.lobe)]
             self.m_flags = self.m_components[0]
             self.directional: HalfSpaceAlbedo | None = None  # made when it is asked for
             self.asked: list[Any] | None = None  # shading frames that it is asked with, while `surface.wrapped` listens
             for name in VARIABLE:
-                setattr(self, name, mi.Spectrum(np.atleast_1d(getattr(self.inside.medium, name)).tolist()))
-            self.inside = self.inside.with_variables(self)
+                setattr(self, name, mi.Spectrum(np.atleast_1d(getattr(self.spec.medium, name)).tolist()))
+            self.spec = self.spec.with_variables(self)
 
         def traverse(self, callback: mi.TraversalCallback) -> None:
-            textured = self.inside.textured
+            textured = self.spec.textured
             for name, texture in textured.textures.items() if textured else ():
                 callback.put(name, texture, mi.ParamFlags.Differentiable)
-            for name in self.inside.constants:
+            for name in self.spec.constants:
                 callback.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
             callback.put("boundary", self.boundary, mi.ParamFlags.Differentiable)
 
         def parameters_changed(self, keys: Any = ()) -> None:
-            # the integrators see another `inside`, and make anew what they made of it
-            repainted = self.inside.textured is not None and not (keys and all(k.startswith("boundary") for k in keys))
-            if repainted or (self.inside.constants and self.inside.textured is None):
-                values = {name: np.ravel(getattr(self, name)) for name in self.inside.constants}
-                self.inside = self.inside.changed(**values).with_variables(self)
-            check_eta(self.boundary, self.inside.medium.eta)
+            # the integrators see another `spec`, and make anew what they made of it
+            repainted = self.spec.textured is not None and not (keys and all(k.startswith("boundary") for k in keys))
+            if repainted or (self.spec.constants and self.spec.textured is None):
+                values = {name: np.ravel(getattr(self, name)) for name in self.spec.constants}
+                self.spec = self.spec.changed(**values).with_variables(self)
+            check_eta(self.boundary, self.spec.medium.eta)
 
         def _shown(self, ctx: mi.BSDFContext, value: Any) -> Any:
-            return value if self.inside.reflection and ctx.component in (0, 0xFFFFFFFF) else 0 * value
+            return value if self.spec.reflection and ctx.component in (0, 0xFFFFFFFF) else 0 * value
 
         def sample(
             self,
@@ -351,10 +351,10 @@ def _class(variant: str) -> type:
             All orders, without what the boundary mirrors: R(mu) of `Medium.reflectance`. The `albedo` of Mitsuba's
             integrator `aov`, which leads denoisers.
             """
-            m = self.inside.medium
+            m = self.spec.medium
             if self.directional is None or not self.directional.serves(m):
                 self.directional = HalfSpaceAlbedo(m)
-            varying, textured, spectral = self.inside.varying, self.inside.textured, self.inside.spectral
+            varying, textured, spectral = self.spec.varying, self.spec.textured, self.spec.spectral
             albedo = self.albedo if varying is None else varying.albedo_at(si.p, active)
             albedo = albedo if textured is None else textured.albedo_at(si, active)
             if spectral is not None:
@@ -363,7 +363,7 @@ def _class(variant: str) -> type:
             return self.directional(albedo, dr.abs(mi.Frame3f.cos_theta(si.wi))) & active
 
         def to_string(self) -> str:
-            return f"Translucent[{self.inside}, boundary = {self.boundary}]"
+            return f"Translucent[{self.spec}, boundary = {self.boundary}]"
 
     return Translucent
 
@@ -420,8 +420,8 @@ PARAMETERS = (
 
 
 @dataclass(frozen=True)
-class Inside:
-    """What is below a translucent surface.
+class MediumSpec:
+    """The medium below a translucent surface, the model of its light and the orders of scattering that count.
 
     Args:
         label: name of the material, or of its coefficients.
@@ -460,7 +460,7 @@ class Inside:
         n = self.medium.n_channels
         return [self.medium] if n is None else [self.medium.channel(k) for k in range(n)]
 
-    def changed(self, **values: np.ndarray) -> Inside:
+    def changed(self, **values: np.ndarray) -> MediumSpec:
         """The same with other constants, and with textures as they are now.
 
         Numbers that are the same in single precision are kept as they are.
@@ -487,7 +487,7 @@ class Inside:
             new = {name: float(value[0]) for name, value in new.items()}
         return replace(self, label="medium", medium=Medium.from_albedo(**new, eta=m.eta))
 
-    def with_variables(self, surface: Any, **more: Any) -> Inside:
+    def with_variables(self, surface: Any, **more: Any) -> MediumSpec:
         """The same, with numbers beside textures as the surface has them, by which light may be differentiated."""
         if self.textured is None:
             return self
@@ -495,8 +495,8 @@ class Inside:
         return replace(self, textured=replace(self.textured, variables=variables | more))
 
 
-def read_inside(props: mi.Properties) -> Inside:
-    """The inside from the parameters of a surface.
+def read_medium_spec(props: mi.Properties) -> MediumSpec:
+    """Read the medium, model and orders from the parameters of a surface.
 
     Raises:
         ValueError: a parameter is missing, unknown in value, or out of range.
@@ -509,7 +509,7 @@ def read_inside(props: mi.Properties) -> Inside:
     model, orders = props.get("model", "neural"), props.get("orders", "total")
     check_choice("orders", orders, ORDERS)
     check_model(model, model_names())
-    return Inside(label, medium, model, orders, bool(props.get("reflection", True)), varying, textured, spectral)
+    return MediumSpec(label, medium, model, orders, bool(props.get("reflection", True)), varying, textured, spectral)
 
 
 COEFFICIENTS = ("sigma_s", "sigma_a", "sigma_t", "albedo", "scale", "reflectance", "mfp", "g", "eta")

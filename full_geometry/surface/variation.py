@@ -74,7 +74,7 @@ class Variation:
     """
 
     def __init__(self, surface: Any, mm_per_unit: float, model: str) -> None:
-        self.surface, self.inside, self.mm_per_unit, self.model = surface, surface.inside, mm_per_unit, model
+        self.surface, self.spec, self.mm_per_unit, self.model = surface, surface.spec, mm_per_unit, model
         self._stencils: dict[str, Stencil] = {}
 
     def prepare(self, transport: Transport | None) -> None:
@@ -87,7 +87,7 @@ class Variation:
             ValueError: the model has no derivatives, knows no medium beside its own, or g of an object with textures is
                 followed.
         """
-        textured = self.inside.textured is not None  # which knows its derivatives but for g
+        textured = self.spec.textured is not None  # which knows its derivatives but for g
         for name in VARIABLE if not textured else ("g",):
             with dr.resume_grad():
                 wanted = dr.grad_enabled(getattr(self.surface, name))
@@ -99,11 +99,11 @@ class Variation:
     def check(self, names: Iterable[str]) -> None:
         """ValueError if the model has no derivative by one of the parameters."""
         for name in names:
-            for m in self.inside.channels():
+            for m in self.spec.channels():
                 self._places(name, m)
 
     def _stencil(self, name: str, transport: Any) -> Stencil:
-        places = [self._places(name, m) for m in self.inside.channels()]
+        places = [self._places(name, m) for m in self.spec.channels()]
         sides = [transport.transport.beside(media) for media in zip(*(media for media, _ in places))]
         columns = zip(*(coefficients for _, coefficients in places))
         return Stencil(sides, [mi.Spectrum([opaque(c) for c in column]) for column in columns])

@@ -158,30 +158,30 @@ def mean_of_grids(medium: VaryingMedium, g: Any, eta: float) -> Medium:
     return Medium.from_albedo(*(v if len(v) > 1 else float(v[0]) for v in (albedo, sigma_t)), g, eta)
 
 
-def equivalent(inside: Any, obj: Geometry) -> Any:
-    """The inside of an object with a homogeneous medium, which models of the half-space take.
+def equivalent(spec: Any, obj: Geometry) -> Any:
+    """The spec with a homogeneous medium, which models of the half-space take.
 
     Its sigma_s and sigma_a are the means over the volume of the object, its albedo and sigma_t those over textures.
     """
-    if inside.textured is not None:
-        return replace(inside, medium=inside.textured.mean(inside.medium.g, inside.medium.eta, obj.shape))
-    if inside.varying is None:
-        return inside
+    if spec.textured is not None:
+        return replace(spec, medium=spec.textured.mean(spec.medium.g, spec.medium.eta, obj.shape))
+    if spec.varying is None:
+        return spec
     p = _points(obj.scene.bbox())
     if obj.closed:
         ray = mi.Ray3f(p, dr.normalize(mi.Vector3f(0.31, 0.87, 0.39)))
         within = np.array(crossings(obj.scene, ray)[1]) % 2 == 1
         if within.any():
             p = mi.Point3f(np.array(p)[:, within])
-    return replace(inside, medium=mean_medium(inside.varying, p, inside.medium.g, inside.medium.eta))
+    return replace(spec, medium=mean_medium(spec.varying, p, spec.medium.g, spec.medium.eta))
 
 
-def warn_of_means(inside: Any, obj: Geometry) -> None:
+def warn_of_means(spec: Any, obj: Geometry) -> None:
     """Warn that models of the half-space take the medium of `equivalent`, if it stands for one that varies."""
-    if inside.varying is not None:
+    if spec.varying is not None:
         warnings.warn(
             f"object {obj.name} varies in space: models of the half-space take its mean sigma_s "
-            f"{inside.medium.sigma_s} and sigma_a {inside.medium.sigma_a} 1/mm",
+            f"{spec.medium.sigma_s} and sigma_a {spec.medium.sigma_a} 1/mm",
             stacklevel=2,
         )
 

@@ -55,7 +55,7 @@ def choose(scene: mi.Scene, settings: Settings) -> Choices:
     shapes = translucent_shapes(scene)
     refuse_instances(scene, shapes, "the model 'auto'")
     on = Stage(scene, shapes, settings.shared(), settings.of_models())
-    named = [settings.model or surface_of(shape).inside.model for shape in on.shapes]
+    named = [settings.model or surface_of(shape).spec.model for shape in on.shapes]
     path = choices_folder() / f"{_identity(on, settings)}.json"
     record = _read(path) if path.is_file() else None
     if record is None or len(record["models"]) != len(named):

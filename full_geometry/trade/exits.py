@@ -108,7 +108,7 @@ def _shows_lamp(scene: Any, shapes: list[Any], si: Any, through: bool) -> Any:
         for shape in shapes:
             here = si.shape == mi.ShapePtr(shape)
             eta, translucent = (
-                dr.select(here, float(surface_of(shape).inside.channels()[0].eta), eta),
+                dr.select(here, float(surface_of(shape).spec.channels()[0].eta), eta),
                 translucent | here,
             )
         active &= translucent

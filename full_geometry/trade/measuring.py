@@ -198,7 +198,7 @@ def _mfp(on: Stage, k: int) -> tuple[float, float]:
     """Mean free paths across an object."""
     box = on.shapes[k].bbox()
     size = float(np.linalg.norm(np.array(box.max, dtype=float) - np.array(box.min, dtype=float))) * on.mm_per_unit
-    thickness = [size * float(m.sigma_t) for m in surface_of(on.shapes[k]).inside.channels()]
+    thickness = [size * float(m.sigma_t) for m in surface_of(on.shapes[k]).spec.channels()]
     return min(thickness), max(thickness)
 
 

@@ -40,7 +40,7 @@ from full_geometry.objects.objects import (
 )
 from full_geometry.registry import AUTO, Choices, choices, lookup
 from full_geometry.settings import AUTOMATIC, Settings
-from full_geometry.surface.translucent import Inside, check_boundary
+from full_geometry.surface.translucent import MediumSpec, check_boundary
 from full_geometry.surface.variation import Variation, VariedTransport
 from full_geometry.surface.varying import equivalent, warn_of_means
 from full_geometry.surface.wrapped import surface_of
@@ -51,32 +51,32 @@ LAMBERT = "lambert"
 RIGID = 1e-3  # of lengths, by which instances of what is learnt may differ
 
 
-def _check_repeated(geometry: Geometry, inside: Inside, settings: Settings) -> None:
+def _check_repeated(geometry: Geometry, spec: MediumSpec, settings: Settings) -> None:
     """ValueError if instances of an object are not what its model or light takes."""
-    if inside.varying is not None:
+    if spec.varying is not None:
         raise ValueError(f"the medium of an instance must not vary in space, got that of object {geometry.name}")
     if settings.light == "gathered":
         raise ValueError(f"light must be sampled of objects that instances show, got gathered of {geometry.name}")
-    of_object = inside.orders != "single" and lookup(inside.model).transport
-    if of_object and inside.model != LAMBERT and geometry.group.stretch > RIGID:
+    of_object = spec.orders != "single" and lookup(spec.model).transport
+    if of_object and spec.model != LAMBERT and geometry.group.stretch > RIGID:
         raise ValueError(
-            f"instances of object {geometry.name} must be moved, turned or mirrored for the model {inside.model!r}, "
+            f"instances of object {geometry.name} must be moved, turned or mirrored for the model {spec.model!r}, "
             f"got lengths that differ by {100 * geometry.group.stretch:.3g} %: give each size a group of its own, or "
             "take translucent_walk or a model of the half-space"
         )
 
 
-def _asked(shape: Any, settings: Settings, model: str | None = None) -> Inside:
+def _asked(shape: Any, settings: Settings, model: str | None = None) -> MediumSpec:
     """What is inside an object, with the model and orders that the integrator asks for."""
-    inside = surface_of(shape).inside
-    asked = {"model": model or settings.model or inside.model, "orders": settings.orders or inside.orders}
-    return inside if asked == {key: getattr(inside, key) for key in asked} else replace(inside, **asked)
+    spec = surface_of(shape).spec
+    asked = {"model": model or settings.model or spec.model, "orders": settings.orders or spec.orders}
+    return spec if asked == {key: getattr(spec, key) for key in asked} else replace(spec, **asked)
 
 
 def _choices(scene: Any, settings: Settings) -> Choices:
     """What stands for "auto", measured if anything is."""
-    insides = [_asked(shape, settings) for shape in translucent_shapes(scene)]
-    if insides and (settings.light == AUTO or any(inside.model == AUTO for inside in insides)):
+    specs = [_asked(shape, settings) for shape in translucent_shapes(scene)]
+    if specs and (settings.light == AUTO or any(spec.model == AUTO for spec in specs)):
         if mi.is_spectral:
             raise ValueError("model must be named under a spectral variant, got 'auto'")
         for shape in outermost(scene):
@@ -85,31 +85,31 @@ def _choices(scene: Any, settings: Settings) -> Choices:
     return Choices({}, settings.light, {})
 
 
-def _make_object(geometry: Geometry, inside: Inside, settings: Settings) -> TranslucentObject:
-    media = tuple(m.scaled(settings.mm_per_unit) for m in inside.channels())
+def _make_object(geometry: Geometry, spec: MediumSpec, settings: Settings) -> TranslucentObject:
+    media = tuple(m.scaled(settings.mm_per_unit) for m in spec.channels())
     check_size(geometry, [float(m.sigma_t) for m in media], settings.mm_per_unit)
-    varying = None if inside.varying is None else inside.varying.scaled(settings.mm_per_unit)
+    varying = None if spec.varying is None else spec.varying.scaled(settings.mm_per_unit)
     obj = TranslucentObject(geometry, media, varying)
-    if inside.textured is not None:
-        inside.textured.check(geometry)
-        even = inside.textured.is_even(geometry.shape)
-        textured = None if even else inside.textured.scaled(settings.mm_per_unit)
+    if spec.textured is not None:
+        spec.textured.check(geometry)
+        even = spec.textured.is_even(geometry.shape)
+        textured = None if even else spec.textured.scaled(settings.mm_per_unit)
         obj = replace(obj, textured=textured, painted=Snapshot.of(geometry.shape))
-    if inside.spectral is not None:
-        obj = replace(obj, spectral=inside.spectral.scaled(settings.mm_per_unit))
-    single_only = inside.orders == "single" or not any(float(m.sigma_s) > 0 for m in media)
+    if spec.spectral is not None:
+        obj = replace(obj, spectral=spec.spectral.scaled(settings.mm_per_unit))
+    single_only = spec.orders == "single" or not any(float(m.sigma_s) > 0 for m in media)
     check_boundary(geometry.name, obj.surface.boundary)
     obj.wrapping.check(geometry)
     if geometry.contents is not None:
-        _check_takes(geometry, inside, single_only)
-    variation = Variation(obj.surface, settings.mm_per_unit, inside.model)
-    if inside.orders == "total" and not single_only and (lookup(inside.model).of_half_space or inside.model == LAMBERT):
-        check_turns(geometry, media, inside.model)
+        _check_takes(geometry, spec, single_only)
+    variation = Variation(obj.surface, settings.mm_per_unit, spec.model)
+    if spec.orders == "total" and not single_only and (lookup(spec.model).of_half_space or spec.model == LAMBERT):
+        check_turns(geometry, media, spec.model)
     none = ObjectModel(None, None)
-    transport, proposals, entries = none if single_only else _model_of(obj, inside, settings)
-    if transport and transport.orders == "total" and inside.orders == "multiple":
-        raise ValueError(f"orders must be total for the model {inside.model!r}, which contains them all, got multiple")
-    low_orders = _low_orders(inside, transport)
+    transport, proposals, entries = none if single_only else _model_of(obj, spec, settings)
+    if transport and transport.orders == "total" and spec.orders == "multiple":
+        raise ValueError(f"orders must be total for the model {spec.model!r}, which contains them all, got multiple")
+    low_orders = _low_orders(spec, transport)
     transport = VariedTransport(transport, variation) if hasattr(transport, "beside") else transport
     entries = entries if settings.entries == AUTOMATIC else settings.entries
     return replace(
@@ -118,51 +118,51 @@ def _make_object(geometry: Geometry, inside: Inside, settings: Settings) -> Tran
     )  # fmt: skip
 
 
-def _check_takes(geometry: Geometry, inside: Inside, single_only: bool) -> None:
+def _check_takes(geometry: Geometry, spec: MediumSpec, single_only: bool) -> None:
     """ValueError if a model does not take what lies inside its object, or some orders only are asked for."""
-    if single_only or not lookup(inside.model).takes_contents:
-        refuse(geometry.contents.found[0], geometry, f"the model {inside.model!r}")
-    if inside.orders != "total":
+    if single_only or not lookup(spec.model).takes_contents:
+        refuse(geometry.contents.found[0], geometry, f"the model {spec.model!r}")
+    if spec.orders != "total":
         raise ValueError(
-            f"orders must be 'total' of objects with something inside, got {inside.orders!r} of object {geometry.name}"
+            f"orders must be 'total' of objects with something inside, got {spec.orders!r} of object {geometry.name}"
         )
 
 
-def _low_orders(inside: Inside, transport: Transport | None) -> tuple[int, ...]:
+def _low_orders(spec: MediumSpec, transport: Transport | None) -> tuple[int, ...]:
     """The orders below two that are traced beside a transport.
 
     No light passes a half-space: its models put into orders from two on what passes something thin.
     """
-    if inside.orders != "total":
-        return (1,) if inside.orders == "single" else ()
+    if spec.orders != "total":
+        return (1,) if spec.orders == "single" else ()
     if transport is not None and transport.orders == "total":
         return ()
-    return (0, 1) if transport is None or lookup(inside.model).knows_objects else (1,)
+    return (0, 1) if transport is None or lookup(spec.model).knows_objects else (1,)
 
 
-def _model_of(obj: TranslucentObject, inside: Inside, settings: Settings) -> ObjectModel:
-    of_object = lookup(inside.model).transport
+def _model_of(obj: TranslucentObject, spec: MediumSpec, settings: Settings) -> ObjectModel:
+    of_object = lookup(spec.model).transport
     if of_object is not None:
         if obj.spectral is not None:
             raise ValueError(
-                f"variant must be RGB or mono for the model {inside.model!r} of object {obj.geometry.name}, got "
+                f"variant must be RGB or mono for the model {spec.model!r} of object {obj.geometry.name}, got "
                 f"{mi.variant()}: translucent_walk and models of the half-space take spectra"
             )
         if obj.textured is not None and not getattr(of_object, "takes_textures", False):
-            refuse_textures(obj.geometry.name, f"the model {inside.model!r}")
-        if obj.wrapping.bend is not None and lookup(inside.model).learner is not None:
+            refuse_textures(obj.geometry.name, f"the model {spec.model!r}")
+        if obj.wrapping.bend is not None and lookup(spec.model).learner is not None:
             raise ValueError(
-                f"object {obj.geometry.name} must be without normal and bump maps for the model {inside.model!r}: "
+                f"object {obj.geometry.name} must be without normal and bump maps for the model {spec.model!r}: "
                 "translucent_walk and models of the half-space take them"
             )
         return of_object(obj, settings)
     if obj.textured is not None:
-        return palette_model(inside.model, obj.geometry, obj.media, obj.textured, settings)
+        return palette_model(spec.model, obj.geometry, obj.media, obj.textured, settings)
     if obj.spectral is not None:
         of_mean = replace(obj.media[0], g=float(np.mean([m.g for m in obj.media])))
-        return palette_model(inside.model, obj.geometry, (of_mean,) * len(obj.media), obj.spectral, settings)
-    warn_of_means(inside, obj.geometry)
-    return half_space_model(inside.model, obj.geometry, obj.media, settings)
+        return palette_model(spec.model, obj.geometry, (of_mean,) * len(obj.media), obj.spectral, settings)
+    warn_of_means(spec, obj.geometry)
+    return half_space_model(spec.model, obj.geometry, obj.media, settings)
 
 
 class TranslucentObjects:
@@ -227,10 +227,10 @@ def make_objects(
     chosen = chosen or _choices(scene, settings)
     models = {id(shape): chosen.models.get(k) for k, shape in enumerate(shapes)}
     named = [each for each in outer if each.shape.id() not in without]
-    insides = [_asked(each.shape, settings, models[id(each.shape)]) for each in named]
-    for each, inside in zip(named, insides):
+    specs = [_asked(each.shape, settings, models[id(each.shape)]) for each in named]
+    for each, spec in zip(named, specs):
         if each.group is not None:
-            _check_repeated(each, inside, settings)
-    results = [_make_object(each, equivalent(inside, each), settings) for each, inside in zip(named, insides)]
+            _check_repeated(each, spec, settings)
+    results = [_make_object(each, equivalent(spec, each), settings) for each, spec in zip(named, specs)]
     instance_scene = InstanceScene.of(scene, groups)
     return [replace(obj, instance_scene=instance_scene) for obj in results]

@@ -20,7 +20,7 @@ from full_geometry.geometry.identity import object_digest
 from full_geometry.geometry.points import opaque
 from full_geometry.geometry.shape import name_of
 from full_geometry.objects.objects import TranslucentObject, refuse_textures
-from full_geometry.surface.translucent import Inside
+from full_geometry.surface.translucent import MediumSpec
 from full_geometry.surface.varying import grid_values
 from full_geometry.surface.wrapped import surface_of
 from full_geometry.transport import any_shape as shapes
@@ -178,20 +178,20 @@ def _contents(obj: TranslucentObject, anchors: np.ndarray) -> tuple[str, list[np
     contents, results = obj.geometry.contents, []
     if contents is None:
         return "", []
-    for shape, inside in zip(contents.shapes, contents.insides):
+    for shape, spec in zip(contents.shapes, contents.specs):
         topology, x = _anchored(shape)
-        words = f"{shape.class_name()} {topology} {_surface(shape, inside, float(obj.media[0].sigma_t))}"
+        words = f"{shape.class_name()} {topology} {_surface(shape, spec, float(obj.media[0].sigma_t))}"
         results.append((words, float(np.linalg.norm(x - anchors[0], axis=1).sum()), x))
     results.sort(key=lambda each: each[:2])
     digest = hashlib.sha256("|".join(words for words, _, _ in results).encode()).hexdigest()[:16]
     return digest, [x for _, _, x in results]
 
 
-def _surface(shape: mi.Shape, inside: Inside | None, sigma_t: float) -> str:
+def _surface(shape: mi.Shape, spec: MediumSpec | None, sigma_t: float) -> str:
     """Of its BSDF and colours, or of its boundary and medium; names of materials and models do not count."""
     bsdf = shape.bsdf()
-    if inside is not None:
-        m = inside.medium
+    if spec is not None:
+        m = spec.medium
         numbers = np.concatenate([np.ravel(v) for v in (m.albedo, m.g, m.sigma_t / max(sigma_t, 1e-30), m.eta)])
         return f"{object_digest(surface_of(shape).boundary)} {[f'{v:.6g}' for v in numbers]}"
     return f"{object_digest(bsdf)} {_painted(shape)} {shape.has_flipped_normals()}"

@@ -25,7 +25,7 @@ from full_geometry.geometry.shape import Geometry, check_together, pointer_numbe
 from full_geometry.objects.inclusions import Content, contents, refracts
 from full_geometry.objects.objects import TranslucentObject, translucent_shapes
 from full_geometry.objects.small_emitters import is_delta
-from full_geometry.surface.translucent import Inside, is_rough, is_smooth_boundary, smooth_boundary
+from full_geometry.surface.translucent import MediumSpec, is_rough, is_smooth_boundary, smooth_boundary
 from full_geometry.surface.varying import VaryingMedium, eval_volume
 from full_geometry.surface.wrapped import Wrapping, surface_of, wrapping_of
 from halfspace_sss.physics.medium import Medium
@@ -134,7 +134,7 @@ def _check(result: list[Content], objects: list[Geometry], instance_table: Insta
         surfaces = [surface_of(holder.shape)]
         if isinstance(content.thing, mi.Shape):
             translucent = bool(surface_of(content.thing))
-            if surfaces[0].inside.textured is not None and (translucent or _displaces(content.thing)):
+            if surfaces[0].spec.textured is not None and (translucent or _displaces(content.thing)):
                 raise ValueError(
                     f"an object with textures must hold nothing that refracts, got {content.name} in {holder.name}"
                 )
@@ -145,9 +145,9 @@ def _check(result: list[Content], objects: list[Geometry], instance_table: Insta
                 )
             surfaces += [surface_of(content.thing)] if translucent else []
         for surface in surfaces:
-            if surface.inside.orders != "total":
+            if surface.spec.orders != "total":
                 raise ValueError(
-                    f"orders must be 'total' of objects with something inside, got {surface.inside.orders!r} where "
+                    f"orders must be 'total' of objects with something inside, got {surface.spec.orders!r} where "
                     f"{content.name} lies inside object {holder.name}"
                 )
 
@@ -186,9 +186,9 @@ class HeterogeneousMedia:
     majorants: list[mi.Float]
 
     @classmethod
-    def of(cls, insides: list[Inside], mm_per_unit: float) -> HeterogeneousMedia:
+    def of(cls, specs: list[MediumSpec], mm_per_unit: float) -> HeterogeneousMedia:
         """Of the insides of objects."""
-        media = [inside.varying or _homogeneous(inside.medium) for inside in insides]
+        media = [inside.varying or _homogeneous(inside.medium) for inside in specs]
         tables = (
             per_channel([m.factor for m in media], mm_per_unit),
             per_channel([m.albedo for m in media], 1.0),
@@ -333,7 +333,7 @@ class WalkMedia:
 
     Args:
         objects: geometry of each shape.
-        insides: the `Inside` of each shape.
+        specs: the `MediumSpec` of each shape.
         scene: a Mitsuba scene that holds these objects, and what is in groups with them.
         boundaries: dielectric BSDF of each shape.
         mm_per_unit: length of a scene unit, mm.
@@ -344,7 +344,7 @@ class WalkMedia:
     """
 
     objects: list[Geometry]
-    insides: list[Inside]
+    specs: list[MediumSpec]
     scene: mi.Scene
     boundaries: list[mi.BSDF]
     mm_per_unit: float
@@ -356,8 +356,8 @@ class WalkMedia:
     def __post_init__(self) -> None:
         instance_table = InstanceTable.of([obj.shape for obj in self.objects], self.shown)
         object.__setattr__(self, "instance_table", instance_table)
-        insides, boundaries = ([rows[kind] for kind in instance_table.kind] for rows in (self.insides, self.boundaries))
-        media, tables = [inside.medium for inside in insides], {}
+        specs, boundaries = ([rows[kind] for kind in instance_table.kind] for rows in (self.specs, self.boundaries))
+        media, tables = [inside.medium for inside in specs], {}
         for key in ("sigma_t", "sigma_s", "g"):
             scale = 1.0 if key == "g" else self.mm_per_unit
             tables[key] = per_channel([getattr(m, key) for m in media], scale)
@@ -366,11 +366,11 @@ class WalkMedia:
         tables["side"] = mi.Float(sum(sides, []))
         tables["first"] = mi.UInt32(np.cumsum([0, *map(len, sides)])[instance_table.kind].tolist())
         tables["step"] = mi.UInt32([int(len(sides[kind]) > 1) for kind in instance_table.kind])
-        tables["fewest"] = mi.UInt32([_FEWEST[inside.orders] for inside in insides])
-        tables["most"] = mi.UInt32([_MOST[inside.orders] for inside in insides])
+        tables["fewest"] = mi.UInt32([_FEWEST[inside.orders] for inside in specs])
+        tables["most"] = mi.UInt32([_MOST[inside.orders] for inside in specs])
         tables["rounding"] = mi.Float(instance_table.rounding.tolist())
-        tables["textured"] = mi.Bool([inside.textured is not None for inside in insides])
-        tables["reflects"] = mi.Bool([inside.reflection for inside in insides])
+        tables["textured"] = mi.Bool([inside.textured is not None for inside in specs])
+        tables["reflects"] = mi.Bool([inside.reflection for inside in specs])
         tables["rough"] = mi.Bool([is_rough(b) for b in boundaries])
         straight = self._straight()
         tables["straight"] = mi.Bool([straight[kind] for kind in instance_table.kind])
@@ -381,18 +381,18 @@ class WalkMedia:
         object.__setattr__(self, "tables", tables)
         object.__setattr__(self, "any_straight", any(straight))
         object.__setattr__(self, "box", _bounds(self.scene))
-        varies = any(inside.varying is not None for inside in insides)
-        object.__setattr__(self, "heterogeneous", HeterogeneousMedia.of(insides, self.mm_per_unit) if varies else None)
+        varies = any(inside.varying is not None for inside in specs)
+        object.__setattr__(self, "heterogeneous", HeterogeneousMedia.of(specs, self.mm_per_unit) if varies else None)
 
     def is_current(self) -> bool:
         """Whether the objects still have the shapes and the media that this was made of."""
-        pairs = zip(self.objects, self.insides)
-        return all(inside is surface_of(obj.shape).inside and obj.is_current() for obj, inside in pairs)
+        pairs = zip(self.objects, self.specs)
+        return all(inside is surface_of(obj.shape).spec and obj.is_current() for obj, inside in pairs)
 
     @property
     def same_g(self) -> bool:
         """Whether g of every medium is the same in all channels."""
-        return all(np.ptp((inside.spectral or inside.medium).g) == 0 for inside in self.insides)
+        return all(np.ptp((inside.spectral or inside.medium).g) == 0 for inside in self.specs)
 
     @property
     def any_rough(self) -> bool:
@@ -428,8 +428,8 @@ class WalkMedia:
 
     def _straight(self) -> list[bool]:
         """By shape, whether its boundary is smooth, of index 1, and everywhere."""
-        mixes = [around.mixes for around in self.wrappings] or [False] * len(self.insides)
-        rows = zip(self.insides, self.boundaries, mixes)
+        mixes = [around.mixes for around in self.wrappings] or [False] * len(self.specs)
+        rows = zip(self.specs, self.boundaries, mixes)
         return [inside.medium.eta == 1 and is_smooth_boundary(b) and not mixed for inside, b, mixed in rows]
 
     def row(self, key: str, k: mi.Int32) -> mi.Float | mi.UInt32 | mi.Bool:
@@ -468,14 +468,14 @@ class WalkMedia:
     @property
     def textured(self) -> bool:
         """Whether a medium has textures, so that walks carry the place where they took it."""
-        return any(inside.textured is not None for inside in self.insides)
+        return any(inside.textured is not None for inside in self.specs)
 
     def fetch(self, k: mi.Int32, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> WalkMedium | tuple[()]:
         """What a walk takes that enters object k at a point of its surface: the medium there; () if none is carried."""
         if not self.carried:
             return ()
         sigma_t, sigma_s, g = (self.spectrum(key, k) for key in ("sigma_t", "sigma_s", "g"))
-        for number, inside in enumerate(self.insides):
+        for number, inside in enumerate(self.specs):
             here = active & self.has_shape(k, number)
             if inside.textured is not None:
                 at = inside.textured.scaled(self.mm_per_unit).at(si, here)
@@ -620,7 +620,7 @@ class WalkMedia:
         instance_table, objects = InstanceTable.of(shapes, shown), [survey(shape, scene) for shape in shapes]
         inner = instance_table.scene(scene)
         for obj, group in zip(objects, instance_table.groups):
-            inside = surface_of(obj.shape).inside
+            inside = surface_of(obj.shape).spec
             if obj.lost > MOST_LOST:
                 raise ValueError(
                     f"an object must have an inside for translucent_walk, got object {obj.name}, which "
@@ -639,7 +639,7 @@ class WalkMedia:
         surfaces, some = [around.surface for around in wrappings], any(a.bend or a.mixes for a in wrappings)
         return cls(
             objects,
-            [surface.inside for surface in surfaces],
+            [surface.spec for surface in surfaces],
             inner,
             [surface.boundary for surface in surfaces],
             float(mm_per_unit),
@@ -655,7 +655,7 @@ _OF_OBJECT: WeakKeyDictionary[TranslucentObject, WalkMedia] = WeakKeyDictionary(
 
 def _boundary(eta: float) -> mi.BSDF:
     """That of another object of the index: kernels call every BSDF that there is, and a new one compiles them anew."""
-    others = (media.boundaries[0] for media in _OF_OBJECT.values() if media.insides[0].medium.eta == eta)
+    others = (media.boundaries[0] for media in _OF_OBJECT.values() if media.specs[0].medium.eta == eta)
     known = next(filter(is_smooth_boundary, others), None)
     return smooth_boundary(eta) if known is None else known
 
@@ -668,7 +668,7 @@ def walk_media(obj: TranslucentObject) -> WalkMedia:
         if len(obj.media) > 1:
             values = {key: np.array([getattr(m, key) for m in obj.media]) for key in ("sigma_s", "sigma_a", "g")}
             medium = Medium(**values, eta=eta)
-        inside, geometry = Inside("medium", medium, "", "total", True, obj.varying, obj.textured), obj.geometry
+        inside, geometry = MediumSpec("medium", medium, "", "total", True, obj.varying, obj.textured), obj.geometry
         alone = InstanceScene([], {}, bounds_of([geometry.shape]))
         instance_scene = alone if geometry.group is None else InstanceScene.of_shapes([geometry.shape])
         result = WalkMedia([geometry], [inside], geometry.scene, [_boundary(eta)], 1.0, instance_scene=instance_scene)
@@ -685,14 +685,14 @@ def media_within(obj: TranslucentObject) -> WalkMedia:
     if contents is None:
         return walk_media(obj)
     if obj not in _WITHIN:
-        alone, shapes = walk_media(obj), [s for s, inside in zip(contents.shapes, contents.insides) if inside]
+        alone, shapes = walk_media(obj), [s for s, inside in zip(contents.shapes, contents.specs) if inside]
         objects = [obj.geometry, *(survey(shape) for shape in shapes)]
         inner = InnerShapes.of(scene_of([obj.geometry.shape, *contents.shapes]), objects)
         boundaries = [*alone.boundaries, *(surface_of(shape).boundary for shape in shapes)]
-        insides = [*alone.insides, *filter(None, contents.insides)]
+        specs = [*alone.specs, *filter(None, contents.specs)]
         own = scene_of([obj.geometry.shape, *shapes])
         instance_scene = InstanceScene([], {}, bounds_of([obj.geometry.shape, *contents.shapes]))
-        _WITHIN[obj] = WalkMedia(objects, insides, own, boundaries, 1.0, inner, instance_scene=instance_scene)
+        _WITHIN[obj] = WalkMedia(objects, specs, own, boundaries, 1.0, inner, instance_scene=instance_scene)
     return _WITHIN[obj]
 
 

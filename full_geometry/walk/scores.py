@@ -345,10 +345,10 @@ def followed(media: WalkMedia) -> list[tuple[int, dict[str, mi.Spectrum]]]:
     result = []
     for k, obj in enumerate(media.objects):
         surface, unit = surface_of(obj.shape), {"sigma_t": media.mm_per_unit}
-        own = [n for n in surface.inside.constants if n == "g" or surface.inside.textured is None]  # the rest by place
+        own = [n for n in surface.spec.constants if n == "g" or surface.spec.textured is None]  # the rest by place
         values = {name: getattr(surface, name) for name in own}
         values = {name: value * unit.get(name, 1.0) for name, value in values.items() if dr.grad_enabled(value)}
-        if "albedo" in values and np.min(surface.inside.medium.albedo) <= 0:
+        if "albedo" in values and np.min(surface.spec.medium.albedo) <= 0:
             raise ValueError(f"albedo must be > 0 to be differentiated by, got 0 in a channel of {obj.name}")
         result += [(k, values)] if values else []
     return result
@@ -361,7 +361,7 @@ def followed_textures(media: WalkMedia) -> dict[int, TexturedMedium]:
         ValueError: the albedo of one of them is 0 somewhere.
     """
     result = {}
-    for k, (obj, inside) in enumerate(zip(media.objects, media.insides)):
+    for k, (obj, inside) in enumerate(zip(media.objects, media.specs)):
         if inside.textured is None:
             continue
         textured = inside.textured.scaled(media.mm_per_unit)

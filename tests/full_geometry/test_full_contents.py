@@ -294,7 +294,7 @@ def untrainable(inside: dict, **more: Any) -> mi.Scene:
 def test_images_of_an_object_with_things_inside_have_the_light_of_walks(truth: str, trained: Trained) -> None:
     if truth == "volpathmis":
         described = scene(both(), reflection=True)
-        described["seed"]["exterior"] = medium(mi.load_dict(described["wax"]["bsdf"]).inside, UNIT)
+        described["seed"]["exterior"] = medium(mi.load_dict(described["wax"]["bsdf"]).spec, UNIT)
         walked = with_media(described, UNIT, {"type": "volpathmis", "max_depth": -1, "rr_depth": 64})
     else:
         walked = mi.load_dict(scene(both(), truth, reflection=True))

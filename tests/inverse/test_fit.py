@@ -278,7 +278,7 @@ def test_a_killed_fit_goes_on_with_the_same_bits_and_the_command_writes_a_scene(
     assert rest.exit_code == 0, rest.output
     numbers = [json.loads((tmp_path / each / "a_fit.json").read_text()) for each in ("whole", "rest")]
     assert all(numbers[0][key] == numbers[1][key] for key in numbers[0] if key != "provenance")
-    medium = open_scene(tmp_path / "rest" / "a_fit.xml").shapes()[0].bsdf().inside.medium
+    medium = open_scene(tmp_path / "rest" / "a_fit.xml").shapes()[0].bsdf().spec.medium
     assert medium.albedo == pytest.approx(numbers[0]["values"]["albedo"])
     assert "[[material]]" in (tmp_path / "rest" / "a_fit.toml").read_text()
     pages = [(tmp_path / each / "a_fit.html").read_text() for each in ("whole", "rest")]

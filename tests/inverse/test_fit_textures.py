@@ -101,7 +101,7 @@ def test_pixels_know_the_texels_that_they_show(tmp_path: Path, kind: str) -> Non
     comparison = ViewComparison(scene, [view], inverse.FitSettings())
     descent = TextureDescent(comparison, TextureParameters.of(["albedo"], shape, 1.0, scene))
     at, si, _ = descent._points(0)
-    seen = np.array(surface_of(shape).inside.textured.textures["albedo"].eval(si))
+    seen = np.array(surface_of(shape).spec.textured.textures["albedo"].eval(si))
     wanted = np.stack([np.bincount(at, c, 144) / np.maximum(np.bincount(at, minlength=144), 1) for c in seen], axis=1)
     found = (descent._footprints[0, 0] @ values.ravel()).reshape(-1, 3)
     np.testing.assert_allclose(found, wanted, atol=2e-4)
@@ -196,7 +196,7 @@ def test_a_killed_fit_of_textures_goes_on_with_the_same_bits_and_writes_a_scene(
     numbers = json.loads((tmp_path / "rest" / "a_fit.json").read_text())
     surface = open_scene(tmp_path / "rest" / "a_fit.xml").shapes()[0].bsdf()
     assert np.ravel(surface.sigma_t) == pytest.approx(numbers["values"]["sigma_t"], rel=1e-6)
-    albedo, _ = surface.inside.textured.values_on(open_scene(tmp_path / "rest" / "a_fit.xml").shapes()[0])
+    albedo, _ = surface.spec.textured.values_on(open_scene(tmp_path / "rest" / "a_fit.xml").shapes()[0])
     means = [row["values"]["albedo"] for row in numbers["steps"]]
     assert means[0] == pytest.approx([0.8] * 3, rel=1e-5) and means[0] != means[-1]
     assert (np.abs(albedo - 0.8) > 1e-3).any()

@@ -41,7 +41,7 @@ def _scene(inside: dict, light: dict, wax: dict | None = None) -> dict:
 
 
 def _around(surface: dict) -> Any:
-    return medium(mi.load_dict(surface).inside, UNIT)
+    return medium(mi.load_dict(surface).spec, UNIT)
 
 
 def _theirs(scene: dict, holders: dict[str, str]) -> Any:

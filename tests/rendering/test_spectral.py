@@ -108,7 +108,7 @@ def test_a_grey_medium_under_d65_is_grey() -> None:
 
 
 def _inside(**parameters: Any) -> Any:
-    return mi.load_dict({"type": "translucent", **parameters}).inside
+    return mi.load_dict({"type": "translucent", **parameters}).spec
 
 
 def test_the_medium_of_a_ray_is_that_of_its_wavelengths() -> None:
@@ -130,7 +130,7 @@ def test_files_and_spectra_of_mitsuba_are_the_same_medium(tmp_path: Path) -> Non
     )
     more = "".join(f'<float name="{k}" value="{v}"/>' for k, v in (("sigma_t", 2.0), ("g", 0.3), ("eta", 1.4)))
     b = _inside(albedo=SPECTRUM, sigma_t=2.0, g=0.3, eta=1.4)
-    for other in (b, mi.load_string(text.format(more)).inside):
+    for other in (b, mi.load_string(text.format(more)).spec):
         for x, y in zip(a.spectral.tables, other.spectral.tables):
             np.testing.assert_allclose(np.array(x), np.array(y), rtol=1e-5)
     assert a.medium.eta == b.medium.eta == 1.4

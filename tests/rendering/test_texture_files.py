@@ -57,7 +57,7 @@ def _inside(parameter: str, texture: Any) -> Any:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         surface = {"type": "translucent", parameter: texture, **SURFACES[parameter], "eta": 1.4}
-        return mi.load_dict(surface).inside
+        return mi.load_dict(surface).spec
 
 
 @pytest.mark.parametrize("parameter", SURFACES)
@@ -91,7 +91,7 @@ def test_the_example_of_the_guide_has_the_colours_of_its_file(tmp_path: Path) ->
     surface = mi.load_string(
         example.replace("skin.png", str(tmp_path / "skin.png")).replace("<bsdf", "<bsdf version='3.0.0'")
     )
-    values = texels(surface.inside.textured.textures["reflectance"])
+    values = texels(surface.spec.textured.textures["reflectance"])
     np.testing.assert_allclose(values, _values(False).reshape(-1, 3), rtol=1e-6)
 
 

@@ -265,7 +265,7 @@ def test_reflectance_becomes_the_medium_of_that_reflectance() -> None:
     colours[0, :2] = [[0, 1e-3, 1], [0.02, 0.5, 0.98]]
     colours *= Medium.from_albedo(1.0, 1.0, 0.6, 1.4).reflectance()
     surface = {"reflectance": _bitmap(colours), "mfp": _bitmap(np.full((1, 1, 3), [0.2, 4.0, 50.0])), "g": 0.6}
-    textured = mi.load_dict({"type": "translucent", **surface, "eta": 1.4}).inside.textured
+    textured = mi.load_dict({"type": "translucent", **surface, "eta": 1.4}).spec.textured
     si = mi.SurfaceInteraction3f()
     si.uv = mi.Point2f((np.arange(32) + 0.5) / 32, 0.5)
     at = textured.at(si)
@@ -283,11 +283,11 @@ def test_colours_that_no_medium_has_are_clipped_with_one_warning() -> None:
     assert len(caught) == 1
     si = mi.SurfaceInteraction3f()
     si.uv = mi.Point2f(0.1, 0.3)
-    assert np.ravel(np.array(surface.inside.textured.at(si).albedo))[0] == 1
+    assert np.ravel(np.array(surface.spec.textured.at(si).albedo))[0] == 1
 
 
 def test_a_number_of_reflectance_is_the_medium_that_has_it() -> None:
-    inside = mi.load_dict({"type": "translucent", "reflectance": "0.8,0.5,0.2", "mfp": 2.0, "g": 0.5}).inside
+    inside = mi.load_dict({"type": "translucent", "reflectance": "0.8,0.5,0.2", "mfp": 2.0, "g": 0.5}).spec
     assert inside.medium == Medium.from_reflectance(np.array([0.8, 0.5, 0.2]), 2.0, 0.5, 1.3)
 
 

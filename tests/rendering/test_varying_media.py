@@ -220,7 +220,7 @@ def test_a_scale_that_varies_under_a_coloured_extinction_has_no_counterpart_in_m
 def test_constant_volumes_and_numbers_are_the_homogeneous_medium() -> None:
     flat = {"type": "constvolume", "value": {"type": "rgb", "value": [0.9, 0.5, 0.1]}}
     surface = {"type": "translucent", "sigma_t": 2.0, "scale": 1.5, "albedo": flat, "g": 0.2, "eta": 1.4}
-    inside = mi.load_dict(surface).inside
+    inside = mi.load_dict(surface).spec
     assert inside.varying is None
     assert inside.medium == Medium.from_albedo(np.float32([0.9, 0.5, 0.1]).astype(float), np.full(3, 3.0), 0.2, 1.4)
 

@@ -71,9 +71,9 @@ def test_a_ball_of_ten_mean_free_paths_is_as_dark_by_a_half_space_as_images_say(
 
 def test_the_scene_is_as_it_was_after_an_assessment() -> None:
     loaded = mi.load_dict(scene(model="standard_dipole"))
-    before = loaded.shapes()[0].bsdf().inside
+    before = loaded.shapes()[0].bsdf().spec
     assess(loaded, models=FEW, **QUICK)
-    assert loaded.shapes()[0].bsdf().inside is before
+    assert loaded.shapes()[0].bsdf().spec is before
 
 
 def test_a_diffuse_surface_is_right_for_a_large_object_under_an_even_sky() -> None:
@@ -290,7 +290,7 @@ def test_auto_is_chosen_of_all_models_once_kept_and_found_again(tmp_path: Path) 
     pinned = mi.load_dict(scene(model="auto"))
     assert mi.render(pinned, spp=1).shape == (64, 64, 3)
     assert pinned.integrator().choices.models[0] == "standard_dipole"
-    assert pinned.shapes()[0].bsdf().inside.model == "auto"
+    assert pinned.shapes()[0].bsdf().spec.model == "auto"
     files[0].write_text("{}")
     with pytest.raises(ValueError, match="delete it to choose anew"):
         damaged = mi.load_dict(scene(model="auto"))
