@@ -186,7 +186,7 @@ class Geometry:
         size: diagonal of the bounding box, scene units.
         area: scene units squared.
         state: `geometry_of` the shape as it was surveyed.
-        contents: the `Contents` that lie inside, for a transport that takes them; None where nothing does.
+        inclusions: the `Inclusions` that lie inside, for a transport that takes them; None where nothing does.
         group: the `instances.Group` whose instances show the shape; None of a shape that stands in the scene itself.
         transform: the `InstanceTransform` of the instance that is met, for rays of the scene; without it rays of a
             shape in a group are in the frame of the group.
@@ -203,7 +203,7 @@ class Geometry:
     size: float
     area: float
     state: Snapshot
-    contents: Any = None
+    inclusions: Any = None
     group: Any = None
     transform: Any = None
     lost: float = 0.0
@@ -216,7 +216,7 @@ class Geometry:
     def is_current(self) -> bool:
         """Whether the shape, and surfaces inside it, still are as they were surveyed."""
         same = geometry_of(self.shape) == self.state
-        return same and (self.contents is None or self.contents.is_current())
+        return same and (self.inclusions is None or self.inclusions.is_current())
 
     def piece(self, prim_index: mi.UInt32, active: mi.Bool) -> Any:
         """The number of the piece that a face belongs to."""

@@ -339,8 +339,8 @@ def _step(
 
 def _blocked(obj: TranslucentObject, p: mi.Point3f, d: mi.Vector3f, length: mi.Float, active: mi.Bool) -> mi.Bool:
     """Whether something inside the object lies on a way from p."""
-    contents = obj.geometry.contents
-    return mi.Bool(False) if contents is None else contents.reach(p, d, length, active)[1]
+    inclusions = obj.geometry.inclusions
+    return mi.Bool(False) if inclusions is None else inclusions.reach(p, d, length, active)[1]
 
 
 def _scatter(
@@ -678,7 +678,7 @@ def _taken(
 
 def _near(obj: TranslucentObject, walk: _Walk, target: mi.Point3f, active: mi.Bool) -> mi.Bool:
     """Whether other connections are looked for: where light of the target is likely to be seen."""
-    if obj.geometry.contents is not None:
+    if obj.geometry.inclusions is not None:
         return mi.Bool(False)
     ray = mi.Ray3f(walk.event, dr.normalize(target - walk.event))
     ray.maxt = NEAR / (dr.min(walk.medium.sigma_t) if walk.medium else opaque(min(m.sigma_t for m in obj.media)))

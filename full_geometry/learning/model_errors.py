@@ -308,9 +308,9 @@ def transport_of(obj: TranslucentObject, model: str, folder: str | os.PathLike |
             it has no S for two points of a surface.
     """
     check_model(model, model_names())
-    contents, entry = obj.geometry.contents, lookup(model)
-    if contents is not None and not entry.takes_contents:
-        refuse(contents.found[0], obj.geometry, f"the model {model!r}")
+    inclusions, entry = obj.geometry.inclusions, lookup(model)
+    if inclusions is not None and not entry.takes_contents:
+        refuse(inclusions.found[0], obj.geometry, f"the model {model!r}")
     if model == KIND:
         return load(find_weights(obj, folder), obj).model
     if obj.textured is not None:

@@ -7,7 +7,7 @@ frames of both, many pairs in a launch. In one group they are looked at once for
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -29,11 +29,11 @@ EACH = -1  # number of an instance that stands for all of its group
 
 
 @dataclass(frozen=True, eq=False)
-class Content:
-    """What lies inside an object.
+class Inclusion:
+    """A shape or a lamp inside an object.
 
     Args:
-        thing: a shape, or an emitter that has none.
+        node: a shape, or an emitter that has none.
         name: what messages call it.
         object: the number of the object, see `instances.InstanceTable`.
         whole: whether all of it lies inside.
@@ -41,7 +41,7 @@ class Content:
         shown: whether it is.
     """
 
-    thing: Any
+    node: mi.Object
     name: str
     object: int
     whole: bool
@@ -49,8 +49,8 @@ class Content:
     shown: bool = False
 
 
-def contents(scene: mi.Scene, objects: list[Geometry]) -> list[Content]:
-    """What lies inside each closed object of a scene: of every shape a part that is deeper than `DEEP`, and lamps.
+def find_inclusions(scene: mi.Scene, objects: list[Geometry]) -> list[Inclusion]:
+    """Find what lies inside each closed object of a scene: shapes of which a part is deeper than `DEEP`, and lamps.
 
     What shines or lets light through counts from the depth on that rays tell.
 
@@ -73,13 +73,13 @@ def contents(scene: mi.Scene, objects: list[Geometry]) -> list[Content]:
                 for k in range(len(group.instances)) if i == EACH else (i,):
                     name = name_of(shape if group is None else group.instances[k])
                     number = int(holders.first[b]) + (k if i == EACH else j)
-                    results.append(Content(shape, f"the shape {name}", number, whole, k, group is not None))
+                    results.append(Inclusion(shape, f"the shape {name}", number, whole, k, group is not None))
     for emitter in scene.emitters():
         place = place_of(emitter)
         for b, holder in enumerate(objects if place is not None else ()):
             inside = is_inside(holder, _into(holders.to_world(b), place[:, None]))
             name, first = f"the emitter {emitter.id()!r}", int(holders.first[b])
-            results += [Content(emitter, name, first + j, True) for j in np.flatnonzero(inside).tolist()]
+            results += [Inclusion(emitter, name, first + j, True) for j in np.flatnonzero(inside).tolist()]
     return results
 
 

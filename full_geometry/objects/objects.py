@@ -47,7 +47,7 @@ from full_geometry.geometry.shape import (
     survey,
 )
 from full_geometry.geometry.snapshot import Snapshot
-from full_geometry.objects.inclusions import Content, contents, place_of
+from full_geometry.objects.inclusions import Inclusion, find_inclusions, place_of
 from full_geometry.registry import lookup
 from full_geometry.surface.spectral import MediumByWavelength
 from full_geometry.surface.textured import SurfaceMedium, TexturedMedium
@@ -62,8 +62,8 @@ from halfspace_sss.physics.medium import Medium
 
 
 @dataclass(frozen=True, eq=False)
-class Contents:
-    """What lies inside one object, for a transport that takes it.
+class Inclusions:
+    """The inclusions of one object, for a transport that takes them.
 
     Args:
         found: shapes that neither emit nor reach out of the object, those inside each other too.
@@ -72,15 +72,15 @@ class Contents:
         surfaces: of each the BSDF as it is.
     """
 
-    found: list[Content]
+    found: list[Inclusion]
     scene: mi.Scene
     specs: list[MediumSpec | None]
     surfaces: list[Snapshot]
 
     @classmethod
-    def of(cls, result: list[Content], world: mi.Scene, mm_per_unit: float) -> Contents:
+    def of(cls, result: list[Inclusion], world: mi.Scene, mm_per_unit: float) -> Inclusions:
         """Of shapes in the scene `world`."""
-        shapes = [content.thing for content in result]
+        shapes = [inclusion.node for inclusion in result]
         surfaces = [surface_of(shape) for shape in shapes]
         below = [surface and surface.spec for surface in surfaces]
         specs = [spec and replace(spec, medium=spec.medium.scaled(mm_per_unit)) for spec in below]
@@ -89,7 +89,7 @@ class Contents:
     @property
     def shapes(self) -> list[mi.Shape]:
         """In the order of the scene."""
-        return [content.thing for content in self.found]
+        return [inclusion.node for inclusion in self.found]
 
     def is_current(self) -> bool:
         """Whether the surfaces still are as they were."""
@@ -97,10 +97,10 @@ class Contents:
 
     def check_held(self) -> None:
         """ValueError if gradients are enabled for a parameter of them: a transport knows no other."""
-        for content in self.found:
-            for key, value in mi.traverse(content.thing).items():
+        for inclusion in self.found:
+            for key, value in mi.traverse(inclusion.node).items():
                 if dr.grad_enabled(value):
-                    raise ValueError(f"{key} of {content.name} inside an object must not have gradients enabled")
+                    raise ValueError(f"{key} of {inclusion.name} inside an object must not have gradients enabled")
 
     def reach(self, o: mi.Point3f, d: mi.Vector3f, length: mi.Float, active: mi.Bool) -> tuple[mi.Float, mi.Bool]:
         """How far a way of some length leads before it meets one of them, and whether it does."""
@@ -109,34 +109,34 @@ class Contents:
         return dr.select(met, hit.t, length), met
 
 
-def filled(scene: mi.Scene, objects: list[Geometry], mm_per_unit: float, what: str) -> list[Geometry]:
-    """The objects of a scene that lie in no other, each with its `contents`.
+def with_inclusions(scene: mi.Scene, objects: list[Geometry], mm_per_unit: float, what: str) -> list[Geometry]:
+    """The objects of a scene that lie in no other, each with its `inclusions`.
 
     Args:
-        scene, objects: as of `contents`.
+        scene, objects: as of `find_inclusions`.
         mm_per_unit: length of a scene unit, mm.
         what: sees neither lamps inside objects, nor what lies partly inside.
 
     Raises:
         ValueError: names such a thing and the object.
     """
-    result = contents(scene, objects)
+    result = find_inclusions(scene, objects)
     kinds = InstanceTable.of([obj.shape for obj in objects], shown_groups(scene)).kind
-    for content in result:
-        holder = objects[kinds[content.object]]
-        lamp = isinstance(content.thing, mi.Emitter) or content.thing.is_emitter()
-        moves = holder.group or (content.shown and any(obj.shape is content.thing for obj in objects))
-        if lamp or moves or not content.whole:
-            refuse(content, holder, what)
-    held = [[content for content in result if kinds[content.object] == k] for k in range(len(objects))]
+    for inclusion in result:
+        holder = objects[kinds[inclusion.object]]
+        lamp = isinstance(inclusion.node, mi.Emitter) or inclusion.node.is_emitter()
+        moves = holder.group or (inclusion.shown and any(obj.shape is inclusion.node for obj in objects))
+        if lamp or moves or not inclusion.whole:
+            refuse(inclusion, holder, what)
+    held = [[inclusion for inclusion in result if kinds[inclusion.object] == k] for k in range(len(objects))]
     return [
-        replace(obj, contents=Contents.of(spec, scene, mm_per_unit)) if spec else obj
-        for obj, spec in zip(objects, held)
-        if not any(obj.shape is content.thing for content in result)
+        replace(obj, inclusions=Inclusions.of(inside, scene, mm_per_unit)) if inside else obj
+        for obj, inside in zip(objects, held)
+        if not any(obj.shape is inclusion.node for inclusion in result)
     ]
 
 
-def refuse(result: Content, holder: Geometry, what: str) -> None:
+def refuse(result: Inclusion, holder: Geometry, what: str) -> None:
     """ValueError that names what lies inside an object, or partly inside, which `what` does not see."""
     raise ValueError(
         f"objects must be empty for {what}, got {result.name} {'' if result.whole else 'partly '}inside "
@@ -167,8 +167,8 @@ def outermost(scene: mi.Scene) -> list[mi.Shape]:
     groups, shapes = shown_groups(scene), translucent_shapes(scene)
     own = [shape for shape in scene.shapes() if surface_of(shape) or is_instance(shape)]
     holders = [a for a in shapes if groups or any(a.bbox().contains(b.bbox()) for b in own if b is not a)]
-    result = contents(scene, [surveyed(shape, scene, groups) for shape in holders])
-    return [shape for shape in shapes if not any(shape is content.thing for content in result)]
+    result = find_inclusions(scene, [surveyed(shape, scene, groups) for shape in holders])
+    return [shape for shape in shapes if not any(shape is inclusion.node for inclusion in result)]
 
 
 def places_of(scene: mi.Scene) -> list:
@@ -350,8 +350,8 @@ class TranslucentObject:
             ValueError: they are asked for, and the model has none.
         """
         self.variation.prepare(self.transport)
-        if self.geometry.contents is not None:
-            self.geometry.contents.check_held()
+        if self.geometry.inclusions is not None:
+            self.geometry.inclusions.check_held()
         if self.textured is None or self.transport is None or self.is_mixed:
             return
         with dr.resume_grad():
@@ -472,7 +472,7 @@ def object_of(
         return TranslucentObject(geometry, media)
     unit = millimetres(shape) if mm_per_unit is None else mm_per_unit
     geometry = surveyed(_object_of(shape, name), shape, shown_groups(shape))
-    (geometry,) = filled(shape, [geometry], unit, "learning")
+    (geometry,) = with_inclusions(shape, [geometry], unit, "learning")
     spec = equivalent(surface_of(geometry.shape).spec, geometry)
     media = _in_scene_units(spec.medium, unit)
     check_geometry(geometry)
@@ -498,24 +498,24 @@ def _in_scene_units(medium: Medium | None, mm_per_unit: float) -> tuple[Medium, 
 
 
 def check_geometry(geometry: Geometry) -> None:
-    """ValueError if the faces of an object point to both sides, as one sign stands for all, or as `_check_contents`."""
+    """ValueError if the faces of an object point to both sides, as one sign stands for all, or as `_check_inclusions`."""
     if geometry.signs is not None:
         raise ValueError(
             f"normals of {geometry.name} must all point to the same side to be learnt, got pieces that disagree"
         )
-    if geometry.contents is not None:
-        _check_contents(geometry.name, geometry.contents)
+    if geometry.inclusions is not None:
+        _check_inclusions(geometry.name, geometry.inclusions)
 
 
 _DELTAS = int(mi.BSDFFlags.Delta) | int(mi.BSDFFlags.GlossyTransmission)  # of BSDFs inside an object
 
 
-def _check_contents(name: str, contents: Contents) -> None:
+def _check_inclusions(name: str, inclusions: Inclusions) -> None:
     """ValueError if something inside an object cannot be learnt: light that it mirrors or refracts is a delta in S."""
-    for content, spec in zip(contents.found, contents.specs):
-        shape = content.thing
-        if content.shown:
-            raise ValueError(f"what lies inside {name} must be no instance to be learnt, got {content.name}")
+    for inclusion, spec in zip(inclusions.found, inclusions.specs):
+        shape = inclusion.node
+        if inclusion.shown:
+            raise ValueError(f"what lies inside {name} must be no instance to be learnt, got {inclusion.name}")
         if not {"faces", "to_world"} & set(mi.traverse(shape).keys()):
             raise ValueError(
                 f"what lies inside {name} must be a mesh or have a transformation to be learnt, got the "

@@ -46,7 +46,7 @@ def has_inner_light(obj: TranslucentObject) -> bool:
     """Whether order 1 of an object can be gathered: one medium of moderate g throughout."""
     g = max(abs(float(m.g)) for m in obj.media)
     scatters = any(float(m.sigma_s) > 0 for m in obj.media)
-    plain = obj.textured is None and obj.varying is None and obj.geometry.contents is None
+    plain = obj.textured is None and obj.varying is None and obj.geometry.inclusions is None
     return bool(obj.low_orders) and 1 in obj.low_orders and plain and scatters and g <= MOST_G
 
 

@@ -141,7 +141,7 @@ def first_event(obj: TranslucentObject, at: SurfacePoint, active: Any = True) ->
     """Of light that goes in or out along w at a point of the surface."""
     sigma_t = obj.sigma_t if obj.textured is None else at.medium.sigma_t
     eta, sign = obj.eta, opaque(obj.geometry.sign)
-    media, contents = walk_media(obj), obj.geometry.contents
+    media, inclusions = walk_media(obj), obj.geometry.inclusions
     d, _, valid = refract_in(at, eta)
     flags = mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
 
@@ -149,7 +149,7 @@ def first_event(obj: TranslucentObject, at: SurfacePoint, active: Any = True) ->
         P, moments, length = sums
         si = obj.geometry.ray_intersect(mi.Ray3f(mi.Point3f(o + off), d), flags, False, active)
         l = dr.select(si.is_valid(), dr.maximum(si.t + dr.dot(off, d), 0), 1e4 / dr.min(sigma_t))  # noqa: E741
-        l, met = (l, mi.Bool(False)) if contents is None else contents.reach(o, d, l, active)  # noqa: E741
+        l, met = (l, mi.Bool(False)) if inclusions is None else inclusions.reach(o, d, l, active)  # noqa: E741
         through, inner = flight(obj, o, d, l, sigma_t)
         through, inner = dr.select(met, 0, through), dr.select(met, inner + through * l, inner)
         part, inner = v * (1 - through), v * inner

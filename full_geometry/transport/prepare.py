@@ -24,19 +24,19 @@ from full_geometry.geometry.shape import (
     name_of,
 )
 from full_geometry.geometry.snapshot import Snapshot, same_objects
-from full_geometry.objects.inclusions import check_sensors, contents
+from full_geometry.objects.inclusions import check_sensors, find_inclusions
 from full_geometry.objects.objects import (
     _MODELS,
     TranslucentObject,
     check_size,
     expected_of,
-    filled,
     outermost,
     places_of,
     refuse,
     refuse_textures,
     surveyed,
     translucent_shapes,
+    with_inclusions,
 )
 from full_geometry.registry import AUTO, Choices, choices, lookup
 from full_geometry.settings import AUTOMATIC, Settings
@@ -100,7 +100,7 @@ def _make_object(geometry: Geometry, spec: MediumSpec, settings: Settings) -> Tr
     single_only = spec.orders == "single" or not any(float(m.sigma_s) > 0 for m in media)
     check_boundary(geometry.name, obj.surface.boundary)
     obj.wrapping.check(geometry)
-    if geometry.contents is not None:
+    if geometry.inclusions is not None:
         _check_takes(geometry, spec, single_only)
     variation = Variation(obj.surface, settings.mm_per_unit, spec.model)
     if spec.orders == "total" and not single_only and (lookup(spec.model).of_half_space or spec.model == LAMBERT):
@@ -121,7 +121,7 @@ def _make_object(geometry: Geometry, spec: MediumSpec, settings: Settings) -> Tr
 def _check_takes(geometry: Geometry, spec: MediumSpec, single_only: bool) -> None:
     """ValueError if a model does not take what lies inside its object, or some orders only are asked for."""
     if single_only or not lookup(spec.model).takes_contents:
-        refuse(geometry.contents.found[0], geometry, f"the model {spec.model!r}")
+        refuse(geometry.inclusions.found[0], geometry, f"the model {spec.model!r}")
     if spec.orders != "total":
         raise ValueError(
             f"orders must be 'total' of objects with something inside, got {spec.orders!r} of object {geometry.name}"
@@ -189,7 +189,7 @@ class TranslucentObjects:
         places = places_of(scene)
         if current and places != self._places:
             results = [obj.geometry for obj in objects]
-            current = not any(geometry.contents for geometry in results) and not contents(scene, results)
+            current = not any(geometry.inclusions for geometry in results) and not find_inclusions(scene, results)
             current = current and not objects[0].instance_scene.shapes
         if not current:
             if not (objects and same):
@@ -222,8 +222,8 @@ def make_objects(
     groups = shown_groups(scene)
     objects = [surveyed(shape, scene, groups) for shape in shapes]
     check_sensors(scene, objects)
-    outer = filled(scene, objects, settings.mm_per_unit, _MODELS)
-    check_together(scene, [part.scene for each in outer for part in (each, each.contents) if part is not None])
+    outer = with_inclusions(scene, objects, settings.mm_per_unit, _MODELS)
+    check_together(scene, [part.scene for each in outer for part in (each, each.inclusions) if part is not None])
     chosen = chosen or _choices(scene, settings)
     models = {id(shape): chosen.models.get(k) for k, shape in enumerate(shapes)}
     named = [each for each in outer if each.shape.id() not in without]

@@ -175,10 +175,10 @@ def _contents(obj: TranslucentObject, anchors: np.ndarray) -> tuple[str, list[np
         obj: the object.
         anchors: its own; of those that are alike inside, the nearest to the first of them comes first.
     """
-    contents, results = obj.geometry.contents, []
-    if contents is None:
+    inclusions, results = obj.geometry.inclusions, []
+    if inclusions is None:
         return "", []
-    for shape, spec in zip(contents.shapes, contents.specs):
+    for shape, spec in zip(inclusions.shapes, inclusions.specs):
         topology, x = _anchored(shape)
         words = f"{shape.class_name()} {topology} {_surface(shape, spec, float(obj.media[0].sigma_t))}"
         results.append((words, float(np.linalg.norm(x - anchors[0], axis=1).sum()), x))

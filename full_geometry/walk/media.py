@@ -22,7 +22,7 @@ from full_geometry.geometry.instances import (
 from full_geometry.geometry.points import lift
 from full_geometry.geometry.rounding import clear
 from full_geometry.geometry.shape import Geometry, check_together, pointer_numbers, scene_of, survey
-from full_geometry.objects.inclusions import Content, contents, refracts
+from full_geometry.objects.inclusions import Inclusion, find_inclusions, refracts
 from full_geometry.objects.objects import TranslucentObject, translucent_shapes
 from full_geometry.objects.small_emitters import is_delta
 from full_geometry.surface.translucent import MediumSpec, is_rough, is_smooth_boundary, smooth_boundary
@@ -42,7 +42,7 @@ MOST_LOST = 0.5  # of the rays that enter an object do not leave it: what is mor
 
 
 @dataclass(frozen=True, eq=False)
-class InnerShapes:
+class InclusionTable:
     """What lies inside the objects of a scene.
 
     Args:
@@ -59,13 +59,13 @@ class InnerShapes:
     lights: list[tuple[mi.Emitter, int]]
 
     @classmethod
-    def of(cls, scene: mi.Scene, objects: list[Geometry]) -> InnerShapes | None:
+    def of(cls, scene: mi.Scene, objects: list[Geometry]) -> InclusionTable | None:
         """What lies inside; None if nothing does.
 
         Raises:
             ValueError: something that refracts lies partly inside or is not closed, or objects count some orders only.
         """
-        result = contents(scene, objects)
+        result = find_inclusions(scene, objects)
         if not result:
             return None
         groups = shown_groups(scene)
@@ -76,20 +76,20 @@ class InnerShapes:
             if not piece.closed:
                 raise ValueError(f"what refracts inside an object must be closed, got the shape {piece.name}")
         if glass:
-            result = contents(scene, [*objects, *glass])
+            result = find_inclusions(scene, [*objects, *glass])
         holders = InstanceTable.of([obj.shape for obj in (*objects, *glass)], groups)
-        inside = [content for content in result if content.object < len(own)]
+        inside = [inclusion for inclusion in result if inclusion.object < len(own)]
         things = [thing for thing in _shapes(inside) if not any(thing is shape for shape in own.shapes)]
         instance_table = InstanceTable.of([*own.shapes, *things], groups)
         first = {id(shape): int(number) for shape, number in zip(instance_table.shapes, instance_table.first)}
         around, lights = np.full(len(instance_table), -1), {}
         holding, held = np.zeros(len(own), dtype=bool), np.zeros(len(instance_table), dtype=bool)
-        for content in _largest_first(result, holders):
-            number = content.object if content.object < len(own) else -1
-            if isinstance(content.thing, mi.Emitter):
-                lights[id(content.thing)] = content.thing, number
-            elif id(content.thing) in first:
-                place = first[id(content.thing)] + content.rank
+        for inclusion in _largest_first(result, holders):
+            number = inclusion.object if inclusion.object < len(own) else -1
+            if isinstance(inclusion.node, mi.Emitter):
+                lights[id(inclusion.node)] = inclusion.node, number
+            elif id(inclusion.node) in first:
+                place = first[id(inclusion.node)] + inclusion.rank
                 around[place], held[place] = number, held[place] or number >= 0
             holding[[number] if number >= 0 else []] = True
         displaces = [_displaces(shape) for shape in instance_table.shapes]
@@ -113,47 +113,47 @@ class InnerShapes:
         return dr.select(number >= 0, dr.gather(type(table), table, dr.maximum(number, 0)), otherwise)
 
 
-def _shapes(result: list[Content]) -> list[mi.Shape]:
-    return list({id(c.thing): c.thing for c in result if isinstance(c.thing, mi.Shape)}.values())
+def _shapes(result: list[Inclusion]) -> list[mi.Shape]:
+    return list({id(c.node): c.node for c in result if isinstance(c.node, mi.Shape)}.values())
 
 
 def _displaces(shape: mi.Shape) -> bool:
     return not surface_of(shape) and refracts(shape)
 
 
-def _largest_first(result: list[Content], holders: InstanceTable) -> list[Content]:
+def _largest_first(result: list[Inclusion], holders: InstanceTable) -> list[Inclusion]:
     """Sorted by the size of what is around, the smallest last."""
     boxes = [ends_of(corners(shape.bbox(), holders.to_world(k))) for k, shape in enumerate(holders.shapes)]
     sizes = np.concatenate([np.linalg.norm(high - low, axis=1) for low, high in boxes])
-    return sorted(result, key=lambda content: -sizes[content.object])
+    return sorted(result, key=lambda inclusion: -sizes[inclusion.object])
 
 
-def _check(result: list[Content], objects: list[Geometry], instance_table: InstanceTable) -> None:
-    for content in result:
-        holder = objects[instance_table.kind[content.object]]
+def _check(result: list[Inclusion], objects: list[Geometry], instance_table: InstanceTable) -> None:
+    for inclusion in result:
+        holder = objects[instance_table.kind[inclusion.object]]
         surfaces = [surface_of(holder.shape)]
-        if isinstance(content.thing, mi.Shape):
-            translucent = bool(surface_of(content.thing))
-            if surfaces[0].spec.textured is not None and (translucent or _displaces(content.thing)):
+        if isinstance(inclusion.node, mi.Shape):
+            translucent = bool(surface_of(inclusion.node))
+            if surfaces[0].spec.textured is not None and (translucent or _displaces(inclusion.node)):
                 raise ValueError(
-                    f"an object with textures must hold nothing that refracts, got {content.name} in {holder.name}"
+                    f"an object with textures must hold nothing that refracts, got {inclusion.name} in {holder.name}"
                 )
-            if not content.whole and (translucent or _displaces(content.thing)):
+            if not inclusion.whole and (translucent or _displaces(inclusion.node)):
                 raise ValueError(
-                    f"what refracts must lie inside an object or outside, got {content.name} partly inside "
+                    f"what refracts must lie inside an object or outside, got {inclusion.name} partly inside "
                     f"object {holder.name}"
                 )
-            surfaces += [surface_of(content.thing)] if translucent else []
+            surfaces += [surface_of(inclusion.node)] if translucent else []
         for surface in surfaces:
             if surface.spec.orders != "total":
                 raise ValueError(
                     f"orders must be 'total' of objects with something inside, got {surface.spec.orders!r} where "
-                    f"{content.name} lies inside object {holder.name}"
+                    f"{inclusion.name} lies inside object {holder.name}"
                 )
 
 
 def _check_mixes(
-    wrappings: list[Wrapping], objects: list[Geometry], instance_table: InstanceTable, inner: InnerShapes | None
+    wrappings: list[Wrapping], objects: list[Geometry], instance_table: InstanceTable, inner: InclusionTable | None
 ) -> None:
     """ValueError if a mask or blend is on an object inside another, or with something inside."""
     alone = np.ones(len(instance_table), dtype=bool) if inner is None else np.array(inner.tables["alone"])
@@ -348,7 +348,7 @@ class WalkMedia:
     scene: mi.Scene
     boundaries: list[mi.BSDF]
     mm_per_unit: float
-    inner: InnerShapes | None = None
+    inner: InclusionTable | None = None
     wrappings: tuple[Wrapping, ...] = ()
     shown: tuple[Group, ...] = ()
     instance_scene: InstanceScene = InstanceScene([], {})
@@ -612,7 +612,7 @@ class WalkMedia:
 
         Raises:
             ValueError: mm_per_unit is not a finite number > 0, an object is a sheet, the medium of an instance varies
-                in space, or as `InnerShapes.of`.
+                in space, or as `InclusionTable.of`.
         """
         if not (np.isfinite(mm_per_unit) and mm_per_unit > 0):
             raise ValueError(f"mm_per_unit must be finite and > 0, got {mm_per_unit!r}")
@@ -630,7 +630,7 @@ class WalkMedia:
                 raise ValueError(f"the medium of an instance must not vary in space, got that of object {obj.name}")
             if inside.textured is not None:
                 inside.textured.check(obj)
-        result = InnerShapes.of(scene, objects)
+        result = InclusionTable.of(scene, objects)
         check_together(scene, [inner, *([result.scene] if result else []), *(obj.scene for obj in objects)])
         wrappings = [wrapping_of(shape) for shape in shapes]
         for around, obj in zip(wrappings, objects):
@@ -681,17 +681,17 @@ _WITHIN: WeakKeyDictionary[TranslucentObject, WalkMedia] = WeakKeyDictionary()
 
 def media_within(obj: TranslucentObject) -> WalkMedia:
     """The same with all that lies inside it, whose objects follow; made once for each."""
-    contents = obj.geometry.contents
-    if contents is None:
+    inclusions = obj.geometry.inclusions
+    if inclusions is None:
         return walk_media(obj)
     if obj not in _WITHIN:
-        alone, shapes = walk_media(obj), [s for s, inside in zip(contents.shapes, contents.specs) if inside]
+        alone, shapes = walk_media(obj), [s for s, inside in zip(inclusions.shapes, inclusions.specs) if inside]
         objects = [obj.geometry, *(survey(shape) for shape in shapes)]
-        inner = InnerShapes.of(scene_of([obj.geometry.shape, *contents.shapes]), objects)
+        inner = InclusionTable.of(scene_of([obj.geometry.shape, *inclusions.shapes]), objects)
         boundaries = [*alone.boundaries, *(surface_of(shape).boundary for shape in shapes)]
-        specs = [*alone.specs, *filter(None, contents.specs)]
+        specs = [*alone.specs, *filter(None, inclusions.specs)]
         own = scene_of([obj.geometry.shape, *shapes])
-        instance_scene = InstanceScene([], {}, bounds_of([obj.geometry.shape, *contents.shapes]))
+        instance_scene = InstanceScene([], {}, bounds_of([obj.geometry.shape, *inclusions.shapes]))
         _WITHIN[obj] = WalkMedia(objects, specs, own, boundaries, 1.0, inner, instance_scene=instance_scene)
     return _WITHIN[obj]
 

@@ -262,7 +262,7 @@ def test_a_thing_inside_one_of_two_objects_of_one_surface_is_inside_that_one_alo
     shared = {"type": "ref", "id": "shared"}
     apart = {"shared": wax(), "wax": ball(1.0, bsdf=shared), "other": ball(1.0, (3, 0, 0), bsdf=shared)}
     loaded = mi.load_dict({**scene(INSIDE["stone"]()), **apart})
-    held = {name: object_of(loaded, None, None, name).geometry.contents for name in ("wax", "other")}
+    held = {name: object_of(loaded, None, None, name).geometry.inclusions for name in ("wax", "other")}
     assert [shape.id() for shape in held["wax"].shapes] == ["stone"] and held["other"] is None
 
 

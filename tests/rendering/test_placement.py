@@ -15,7 +15,7 @@ from test_rendering_normals import ellipsoid
 mi = pytest.importorskip("mitsuba")
 
 from full_geometry.geometry.shape import survey  # noqa: E402
-from full_geometry.objects.objects import contents  # noqa: E402
+from full_geometry.objects.objects import find_inclusions  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -201,7 +201,7 @@ def test_what_stands_at_the_surface_of_an_object_is_not_inside() -> None:
     floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -3.999]).scale(400)}
     lamp = {"type": "point", "position": [0, 0, 4.1]}
     scene = mi.load_dict(view("bssrdf", wax=ball(), floor=floor, lamp=lamp, near=_stone(center=[0, 6, 0])))
-    assert contents(scene, [survey(shape) for shape in scene.shapes() if shape.id() == "wax"]) == []
+    assert find_inclusions(scene, [survey(shape) for shape in scene.shapes() if shape.id() == "wax"]) == []
 
 
 def test_a_curve_that_is_moved_into_an_object_by_its_points_is_refused_at_the_next_render(tmp_path: Path) -> None:
