@@ -166,7 +166,7 @@ def _turned(n: int, first: np.ndarray, second: np.ndarray, same: np.ndarray, nam
     return np.unique(least, return_inverse=True)[1].reshape(-1), np.where(label[:n] == least, 1.0, -1.0)
 
 
-RAYS = 4096  # of the survey
+RAYS = 4096  # of `analyse_shape`
 MOST_HITS = 64  # that one ray counts
 MAJORITY = 0.75  # of the first hits from outside agree on the side of the normals, unless the object is a sheet
 
@@ -185,7 +185,7 @@ class Geometry:
         pieces: UInt32 array of the connected piece of each face, or None if there is one piece.
         size: diagonal of the bounding box, scene units.
         area: scene units squared.
-        state: `geometry_of` the shape as it was surveyed.
+        state: `geometry_of` the shape when it was analysed.
         inclusions: the `Inclusions` that lie inside, for a transport that takes them; None where nothing does.
         group: the `instances.Group` whose instances show the shape; None of a shape that stands in the scene itself.
         transform: the `InstanceTransform` of the instance that is met, for rays of the scene; without it rays of a
@@ -214,7 +214,7 @@ class Geometry:
         return name_of(self.shape)
 
     def is_current(self) -> bool:
-        """Whether the shape, and surfaces inside it, still are as they were surveyed."""
+        """Whether the shape, and surfaces inside it, still are as they were."""
         same = geometry_of(self.shape) == self.state
         return same and (self.inclusions is None or self.inclusions.is_current())
 
@@ -274,8 +274,8 @@ class Geometry:
         return dr.gather(mi.Float, self.signs, prim_index, active)
 
 
-def survey(shape: mi.Shape, world: mi.Scene | None = None) -> Geometry:
-    """Look at a shape from outside with rays; warns if it is not closed, or if its faces point to both sides.
+def analyse_shape(shape: mi.Shape, world: mi.Scene | None = None, groups: Iterable[Any] = ()) -> Geometry:
+    """Find by rays from outside which side of a shape is out; warns if it is open or its faces point to both sides.
 
     A mesh is closed if its edges say so. Rays decide for others, and where edges of faces that touch do not match.
     Faces of a closed mesh that point to both sides are taken the right way round.
@@ -283,6 +283,7 @@ def survey(shape: mi.Shape, world: mi.Scene | None = None) -> Geometry:
     Args:
         shape: of Mitsuba.
         world: the scene that it stands in, if rays are traced in both by one kernel.
+        groups: `instances.Group` of each group that instances in the scene show.
 
     Raises:
         ValueError: the shape is an instance, whose geometry belongs to several objects; faces of a mesh exist twice; or
@@ -322,8 +323,11 @@ def survey(shape: mi.Shape, world: mi.Scene | None = None) -> Geometry:
     area = float(np.sum(np.array(shape.surface_area())))
     closed, sign = odd == 0 and not sheet, -1.0 if share <= 1 - MAJORITY else 1.0
     signs = votes.signs() if closed else None
-    return Geometry(shape, scene, sign, signs, float(votes.opposed[0]) == 0, closed, votes.pieces, size,
-                  area, geometry_of(shape), lost=odd)  # fmt: skip
+    return Geometry(
+        shape=shape, scene=scene, sign=sign, signs=signs, agree=float(votes.opposed[0]) == 0, closed=closed,
+        pieces=votes.pieces, size=size, area=area, state=geometry_of(shape), lost=odd,
+        group=next((group for group in groups if any(shape is part for part in group.shapes)), None),
+    )  # fmt: skip
 
 
 PLACES = ("to_world", "vertex_positions", "vertex_normals", "faces", "grid", "control_points", "data", "extent")

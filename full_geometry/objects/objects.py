@@ -18,7 +18,6 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.geometry.instances import (
-    Group,
     InstanceProposals,
     InstanceScene,
     InstanceTable,
@@ -40,11 +39,11 @@ from full_geometry.geometry.points import (
 )
 from full_geometry.geometry.shape import (
     Geometry,
+    analyse_shape,
     geometry_of,
     is_instance,
     name_of,
     scene_of,
-    survey,
 )
 from full_geometry.geometry.snapshot import Snapshot
 from full_geometry.objects.inclusions import Inclusion, find_inclusions, place_of
@@ -167,7 +166,7 @@ def outermost(scene: mi.Scene) -> list[mi.Shape]:
     groups, shapes = shown_groups(scene), translucent_shapes(scene)
     own = [shape for shape in scene.shapes() if surface_of(shape) or is_instance(shape)]
     holders = [a for a in shapes if groups or any(a.bbox().contains(b.bbox()) for b in own if b is not a)]
-    result = find_inclusions(scene, [surveyed(shape, scene, groups) for shape in holders])
+    result = find_inclusions(scene, [analyse_shape(shape, scene, groups) for shape in holders])
     return [shape for shape in shapes if not any(shape is inclusion.node for inclusion in result)]
 
 
@@ -371,12 +370,6 @@ class TranslucentObject:
         return same and self.surface.spec is self.variation.spec and self.geometry.is_current()
 
 
-def surveyed(shape: mi.Shape, scene: mi.Scene, groups: Sequence[Group]) -> Geometry:
-    """`survey` of a shape of a scene that shows these groups."""
-    group = next((each for each in groups if any(shape is part for part in each.shapes)), None)
-    return replace(survey(shape, scene), group=group)
-
-
 class KnowsUnit(abc.ABC):
     """An integrator that says how long a unit of its scene is: `bssrdf` and `translucent_walk`.
 
@@ -466,12 +459,12 @@ def object_of(
     if mi.is_spectral:
         raise ValueError(f"variant must be RGB or mono for an object to be learnt, got {mi.variant()}")
     if not isinstance(shape, mi.Scene):
-        geometry = survey(shape)
+        geometry = analyse_shape(shape)
         media = _in_scene_units(medium, 1.0 if mm_per_unit is None else mm_per_unit)
         check_geometry(geometry)
         return TranslucentObject(geometry, media)
     unit = millimetres(shape) if mm_per_unit is None else mm_per_unit
-    geometry = surveyed(_object_of(shape, name), shape, shown_groups(shape))
+    geometry = analyse_shape(_object_of(shape, name), shape, shown_groups(shape))
     (geometry,) = with_inclusions(shape, [geometry], unit, "learning")
     spec = equivalent(surface_of(geometry.shape).spec, geometry)
     media = _in_scene_units(spec.medium, unit)
@@ -498,7 +491,7 @@ def _in_scene_units(medium: Medium | None, mm_per_unit: float) -> tuple[Medium, 
 
 
 def check_geometry(geometry: Geometry) -> None:
-    """ValueError if the faces of an object point to both sides, as one sign stands for all, or as `_check_inclusions`."""
+    """ValueError if faces of an object point to both sides, as one sign stands for all; or as `_check_inclusions`."""
     if geometry.signs is not None:
         raise ValueError(
             f"normals of {geometry.name} must all point to the same side to be learnt, got pieces that disagree"

@@ -20,6 +20,7 @@ from full_geometry.geometry.points import (
 from full_geometry.geometry.shape import (
     Geometry,
     SceneMark,
+    analyse_shape,
     check_together,
     name_of,
 )
@@ -34,7 +35,6 @@ from full_geometry.objects.objects import (
     places_of,
     refuse,
     refuse_textures,
-    surveyed,
     translucent_shapes,
     with_inclusions,
 )
@@ -220,7 +220,7 @@ def make_objects(
     if not shapes:
         raise ValueError("the scene must have an object with a translucent BSDF, got none")
     groups = shown_groups(scene)
-    objects = [surveyed(shape, scene, groups) for shape in shapes]
+    objects = [analyse_shape(shape, scene, groups) for shape in shapes]
     check_sensors(scene, objects)
     outer = with_inclusions(scene, objects, settings.mm_per_unit, _MODELS)
     check_together(scene, [part.scene for each in outer for part in (each, each.inclusions) if part is not None])

@@ -21,7 +21,7 @@ from full_geometry.geometry.instances import (
 )
 from full_geometry.geometry.points import lift
 from full_geometry.geometry.rounding import clear
-from full_geometry.geometry.shape import Geometry, check_together, pointer_numbers, scene_of, survey
+from full_geometry.geometry.shape import Geometry, analyse_shape, check_together, pointer_numbers, scene_of
 from full_geometry.objects.inclusions import Inclusion, find_inclusions, refracts
 from full_geometry.objects.objects import TranslucentObject, translucent_shapes
 from full_geometry.objects.small_emitters import is_delta
@@ -71,7 +71,7 @@ class InclusionTable:
         groups = shown_groups(scene)
         own = InstanceTable.of([obj.shape for obj in objects], groups)
         _check(result, objects, own)
-        glass = [survey(thing, scene) for thing in _shapes(result) if _displaces(thing)]
+        glass = [analyse_shape(thing, scene) for thing in _shapes(result) if _displaces(thing)]
         for piece in glass:
             if not piece.closed:
                 raise ValueError(f"what refracts inside an object must be closed, got the shape {piece.name}")
@@ -617,7 +617,7 @@ class WalkMedia:
         if not (np.isfinite(mm_per_unit) and mm_per_unit > 0):
             raise ValueError(f"mm_per_unit must be finite and > 0, got {mm_per_unit!r}")
         shapes, shown = translucent_shapes(scene), shown_groups(scene)
-        instance_table, objects = InstanceTable.of(shapes, shown), [survey(shape, scene) for shape in shapes]
+        instance_table, objects = InstanceTable.of(shapes, shown), [analyse_shape(shape, scene) for shape in shapes]
         inner = instance_table.scene(scene)
         for obj, group in zip(objects, instance_table.groups):
             inside = surface_of(obj.shape).spec
@@ -686,7 +686,7 @@ def media_within(obj: TranslucentObject) -> WalkMedia:
         return walk_media(obj)
     if obj not in _WITHIN:
         alone, shapes = walk_media(obj), [s for s, inside in zip(inclusions.shapes, inclusions.specs) if inside]
-        objects = [obj.geometry, *(survey(shape) for shape in shapes)]
+        objects = [obj.geometry, *(analyse_shape(shape) for shape in shapes)]
         inner = InclusionTable.of(scene_of([obj.geometry.shape, *inclusions.shapes]), objects)
         boundaries = [*alone.boundaries, *(surface_of(shape).boundary for shape in shapes)]
         specs = [*alone.specs, *filter(None, inclusions.specs)]

@@ -22,12 +22,12 @@ def test_random_scenes_come_again_by_their_number(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("number", range(6))
 def test_a_random_scene_is_closed_and_faces_outwards(number: int, tmp_path: Path) -> None:
-    from full_geometry.geometry.shape import survey
+    from full_geometry.geometry.shape import analyse_shape
     from full_geometry.scenes.scene_files import load_objects
 
     loaded = load_objects(write_scene(random_scene(number, 5), tmp_path))
     (shape,) = (s for s in loaded.shapes() if s.id() == "object")
-    found = survey(shape)
+    found = analyse_shape(shape)
     assert found.closed and found.upright and found.size == pytest.approx(100, rel=0.01)
 
 

@@ -12,7 +12,7 @@ from halfspace_sss import Medium
 
 mi = pytest.importorskip("mitsuba")
 
-from full_geometry.geometry.shape import survey  # noqa: E402
+from full_geometry.geometry.shape import analyse_shape  # noqa: E402
 from full_geometry.transport.half_space import MOST_STRAIGHT, straight_share  # noqa: E402
 from halfspace_sss.interface.model import models  # noqa: E402
 
@@ -58,20 +58,20 @@ def test_the_share_of_a_ball_and_of_a_cube_is_that_of_their_chords(tau: float) -
     media = [Medium(0.0, tau / 2, 0.0, 1.0), Medium(tau, 0.0, 0.5, 1.0), Medium(tau / 2, 0.0, -0.5, 1.0)]
     expected = 2 * (1 - (1 + tau) * np.exp(-tau)) / tau**2
     np.testing.assert_allclose(
-        straight_share(survey(mi.load_dict({"type": "sphere"})), media), expected, atol=LARGEST_ERROR
+        straight_share(analyse_shape(mi.load_dict({"type": "sphere"})), media), expected, atol=LARGEST_ERROR
     )
     rng = np.random.default_rng(3)
     start = np.column_stack([rng.uniform(-1, 1, (2**17, 2)), np.full(2**17, -1.0)])  # on a face, by the cosine
     mu, phi = np.sqrt(rng.random(2**17)), 2 * np.pi * rng.random(2**17)
     d = np.column_stack([np.sqrt(1 - mu**2) * np.cos(phi), np.sqrt(1 - mu**2) * np.sin(phi), mu])
     ways = ((np.sign(d) - start) / d).min(axis=1)
-    cube = straight_share(survey(mi.load_dict({"type": "cube"})), media)
+    cube = straight_share(analyse_shape(mi.load_dict({"type": "cube"})), media)
     np.testing.assert_allclose(cube, np.exp(-tau / 2 * ways).mean(), atol=LARGEST_ERROR)
 
 
 def test_no_light_passes_a_plane() -> None:
     with pytest.warns(UserWarning, match="not closed"):
-        plane = survey(mi.load_dict({"type": "rectangle"}))
+        plane = analyse_shape(mi.load_dict({"type": "rectangle"}))
     assert straight_share(plane, [Medium(0.0, 1e-3, 0.0, 1.4)]) == 0
 
 

@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from full_geometry.geometry.shape import Geometry, faces_of, survey
+from full_geometry.geometry.shape import Geometry, analyse_shape, faces_of
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -38,7 +38,7 @@ def _ball(n: int) -> tuple[np.ndarray, np.ndarray]:
 def _surveyed(vertices: np.ndarray, faces: np.ndarray, to: str = "error") -> Geometry:
     with warnings.catch_warnings():
         warnings.simplefilter(to)
-        return survey(_mesh(vertices, faces))
+        return analyse_shape(_mesh(vertices, faces))
 
 
 PLACES = [np.zeros(3), *10.0 ** np.arange(1, 5)[:, None] * [[1, -0.3, 0.7], [0, 1, 0], [-0.2, 0.1, 1], [1, 1, 1]]]
@@ -59,7 +59,7 @@ def test_a_die_is_closed_at_ten_metres_from_the_origin() -> None:
     die = {"type": "cube", "to_world": t.translate([1e4, 0, 0]).rotate([0, 0, 1], 30).scale(2.5)}
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert survey(mi.load_dict(die)).closed
+        assert analyse_shape(mi.load_dict(die)).closed
 
 
 def test_a_mesh_without_one_of_its_faces_is_open_and_with_an_edge_of_four_faces_closed() -> None:

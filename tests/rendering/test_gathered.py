@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from full_geometry.geometry.shape import survey
+from full_geometry.geometry.shape import analyse_shape
 from full_geometry.integrators.gathering import _steadied, _stratified
 from full_geometry.learning.meshes import Box, surface
 from full_geometry.learning.shapes import box
@@ -273,7 +273,7 @@ def test_every_place_of_a_surface_in_rows_of_faces_has_a_point_in_reach() -> Non
     def even_box(p: np.ndarray) -> np.ndarray:
         return box(p, np.array([1.0, 0.7, 1.0]), 0.25)
 
-    geometry = survey(surface(even_box, Box((-1.1, -0.8, -1.1), (1.1, 0.8, 1.1)), 96).mitsuba("box"))
+    geometry = analyse_shape(surface(even_box, Box((-1.1, -0.8, -1.1), (1.1, 0.8, 1.1)), 96).mitsuba("box"))
     u = np.random.default_rng(5).random((3, 200_000)).astype(np.float32)
     at = uniform_entries(geometry, mi.Float(u[0]), mi.Point2f(u[1:]))
     for count in (512, 2048):

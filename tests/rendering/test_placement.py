@@ -14,7 +14,7 @@ from test_rendering_normals import ellipsoid
 
 mi = pytest.importorskip("mitsuba")
 
-from full_geometry.geometry.shape import survey  # noqa: E402
+from full_geometry.geometry.shape import analyse_shape  # noqa: E402
 from full_geometry.objects.objects import find_inclusions  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -97,10 +97,10 @@ def test_a_mesh_whose_faces_point_to_both_sides_is_turned_with_a_warning(smooth:
     right, mixed = (mi.load_dict(mesh(tmp_path, faces, smooth)) for faces in (ellipsoid()[1], _mixed()))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        whole = survey(right)
+        whole = analyse_shape(right)
     said = "point to both sides: [0-9]+ of 528 were turned" + (", and vertex normals were made anew" if smooth else "$")
     with pytest.warns(UserWarning, match=said):
-        found = survey(mixed)
+        found = analyse_shape(mixed)
     assert found.closed and whole.signs is None
     turned = (_mixed() != ellipsoid()[1]).any(axis=1)
     np.testing.assert_array_equal(np.array(found.signs), np.where(turned, -1, 1))
@@ -132,7 +132,7 @@ def test_faces_to_both_sides_of_a_mesh_with_a_hole_are_refused(integrator: str, 
 def test_a_surface_of_one_side_is_refused(tmp_path: Path) -> None:
     strip = np.array([[0, 1, 2], [2, 1, 3], [2, 3, 4], [4, 3, 5], [4, 5, 1], [1, 5, 0]])  # of Möbius
     with pytest.raises(ValueError, match="must have two sides, got a one-sided strip"):
-        survey(mi.load_dict(mesh(tmp_path, strip)))
+        analyse_shape(mi.load_dict(mesh(tmp_path, strip)))
 
 
 def _stone(**more: Any) -> dict:
@@ -201,7 +201,7 @@ def test_what_stands_at_the_surface_of_an_object_is_not_inside() -> None:
     floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -3.999]).scale(400)}
     lamp = {"type": "point", "position": [0, 0, 4.1]}
     scene = mi.load_dict(view("bssrdf", wax=ball(), floor=floor, lamp=lamp, near=_stone(center=[0, 6, 0])))
-    assert find_inclusions(scene, [survey(shape) for shape in scene.shapes() if shape.id() == "wax"]) == []
+    assert find_inclusions(scene, [analyse_shape(shape) for shape in scene.shapes() if shape.id() == "wax"]) == []
 
 
 def test_a_curve_that_is_moved_into_an_object_by_its_points_is_refused_at_the_next_render(tmp_path: Path) -> None:

@@ -19,10 +19,10 @@ pytestmark = pytest.mark.usefixtures("quiet_rgb")
 
 def position_sampler(shape: dict, share: float):
     from full_geometry.geometry.points import AreaPoints, PositionSampler, RadialTable
-    from full_geometry.geometry.shape import survey
+    from full_geometry.geometry.shape import analyse_shape
 
     scene = mi.load_dict({"type": "scene", "object": shape})
-    found = survey(scene.shapes()[0])
+    found = analyse_shape(scene.shapes()[0])
     table = RadialTable([bssrdf("standard_dipole", m) for m in MODELS], found.size)
     return PositionSampler(found, table, AreaPoints(found.shape), share)
 
