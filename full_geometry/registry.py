@@ -5,7 +5,7 @@ The half-space models are those of `interface.model`. Packages add others by ent
 - `halfspace_sss.transports`: a function of (object, settings) that returns an `ObjectModel`: of the
   `TranslucentObject`, geometry and media, and the `Settings` of the integrator; where S has the paths that meet what
   lies inside an object, of all orders, it has an attribute `takes_contents` that is true; where it takes media by
-  textures, `takes_textures`; where it has derivatives by the medium, as of `variation.Neighboured`, `varies_as`, the
+  textures, `takes_textures`; where it has derivatives by the medium, as of `PerturbableTransport`, `varies_as`, the
   name of a half-space model that knows the same media;
 - `halfspace_sss.learners`: a module or object that learns the model, see `scenes.learners`;
 - `halfspace_sss.choosers`: a function of (scene, settings) that returns `Choices`, what stands for the name in a scene;

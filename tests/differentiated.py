@@ -110,10 +110,10 @@ def forward(scene, key: str) -> float:
 
 
 class Shifted:
-    """Stands in for the `Variation` of a body: coefficients of another medium along paths of this one."""
+    """Stands in for the `MediumDerivatives` of a body: coefficients of another medium along paths of this one."""
 
     def __init__(self, body, name: str, h: float, only: int | None) -> None:
-        self.spec, self.model, self.media = body.variation.spec, body.variation.model, []
+        self.spec, self.model, self.media = body.derivatives.spec, body.derivatives.model, []
         for k, m in enumerate(self.spec.channels()):
             ratios = {key: float(getattr(m, key)) for key in ("albedo", "sigma_t", "g")}
             ratios[name] += h if only in (None, k) else 0.0
@@ -127,7 +127,7 @@ class Shifted:
         if own is None:
             return None
         if self.spec.model not in UNTRAINED:
-            return own.transport.beside(self.media)
+            return own.transport.perturbed(self.media)
         models = []  # by the scaling law, so that the stand-ins keep their weights
         for c, m in zip(self.spec.channels(), self.media):
             one, s = bssrdf(self.spec.model, c.in_mfp()), float(m.sigma_t)
@@ -140,8 +140,8 @@ class Shifted:
         return [tuple(opaque(v) for v in (m.sigma_s, m.sigma_t, m.g)) for m in self.media]
 
 
-def varied(body, variation):
-    return dataclasses.replace(body, variation=variation, transport=variation.transport(body.transport))
+def varied(body, derivatives):
+    return dataclasses.replace(body, derivatives=derivatives, transport=derivatives.transport(body.transport))
 
 
 def medium_difference(scene, name: str, only: int | None = None) -> tuple[float, float]:

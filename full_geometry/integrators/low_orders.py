@@ -129,7 +129,7 @@ def sample_low_orders(
             of_exit = obj.textured.followed(obj.geometry, refracted.out, active)
         media = _media(obj, of_exit)
     else:
-        media = obj.variation.coefficients(obj.media)
+        media = obj.derivatives.coefficients(obj.media)
     f = _contribution(media, walk.length, walk.order, walk.cosine)
     weight = dr.select(counts, f * (walk.inverse_pdf * refracted.T), 0)
 

@@ -13,8 +13,8 @@ from full_geometry.geometry.shape import name_of
 from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.objects.objects import KnowsUnit, translucent_shapes
 from full_geometry.registry import lookup
+from full_geometry.surface.medium_derivatives import MediumDerivatives
 from full_geometry.surface.translucent import VARIABLE
-from full_geometry.surface.variation import Variation
 from full_geometry.surface.wrapped import surface_of
 from halfspace_sss.checks import check_choice
 from halfspace_sss.interface.model import bssrdf
@@ -67,7 +67,7 @@ def check_derivatives(integrator: mi.Integrator, shape: mi.Shape, names: Sequenc
             raise ValueError(f"g must not be fitted beside textures by {model!r}: translucent_walk has its derivative")
         return
     coefficients = ["sigma_t" if name == "mfp" else name for name in names]
-    Variation(surface_of(shape), integrator.mm_per_unit, model).check(n for n in coefficients if n in VARIABLE)
+    MediumDerivatives(surface_of(shape), integrator.mm_per_unit, model).check(n for n in coefficients if n in VARIABLE)
 
 
 def check_names(names: Sequence[str], known: Sequence[str]) -> None:

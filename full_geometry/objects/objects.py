@@ -48,10 +48,10 @@ from full_geometry.geometry.shape import (
 from full_geometry.geometry.snapshot import Snapshot
 from full_geometry.objects.inclusions import Inclusion, find_inclusions, place_of
 from full_geometry.registry import lookup
+from full_geometry.surface.medium_derivatives import MediumDerivatives
 from full_geometry.surface.spectral import MediumByWavelength
 from full_geometry.surface.textured import SurfaceMedium, TexturedMedium
 from full_geometry.surface.translucent import MediumSpec, check_boundary
-from full_geometry.surface.variation import Variation
 from full_geometry.surface.varying import VaryingMedium, equivalent
 from full_geometry.surface.wrapped import Wrapping, surface_of, wrapping_of
 from halfspace_sss import measure
@@ -229,7 +229,7 @@ class TranslucentObject:
         entries: how many of them an exit draws.
         low_orders: the orders below two that are traced beside it: (0, 1), (1,) or none.
         expected: what each kind of light is expected to bring.
-        variation: how its light varies with its medium.
+        derivatives: of its light by its medium.
         gathered: what leaves by orders from two on, in place of a transport, see `integrators.gathering`.
         painted: its shape as it was, whose attributes textures show, if the surface has textures.
         instance_scene: of the scene that it is rendered in.
@@ -245,7 +245,7 @@ class TranslucentObject:
     entries: int = 1
     low_orders: tuple[int, ...] = ()
     expected: Expected | None = None
-    variation: Variation | None = None
+    derivatives: MediumDerivatives | None = None
     gathered: Any = None
     painted: Snapshot | None = None
     instance_scene: InstanceScene = InstanceScene([], {})
@@ -267,7 +267,7 @@ class TranslucentObject:
             proposals = InstanceProposals(proposals, transform)
             if self.is_mixed:
                 transport = replace(transport, obj=geometry)
-            elif lookup(self.variation.model).transport is not None:
+            elif lookup(self.derivatives.model).transport is not None:
                 transport = InstanceTransport(transport, transform)
         return replace(self, geometry=geometry, transport=transport, proposals=proposals)
 
@@ -275,7 +275,7 @@ class TranslucentObject:
     def is_mixed(self) -> bool:
         """Whether half-space models are mixed over its texture or spectrum, see `transport.palette`."""
         varies = self.textured is not None or self.spectral is not None
-        return varies and lookup(self.variation.model).of_half_space
+        return varies and lookup(self.derivatives.model).of_half_space
 
     @functools.cached_property
     def wrapping(self) -> Wrapping:
@@ -348,7 +348,7 @@ class TranslucentObject:
         Raises:
             ValueError: they are asked for, and the model has none.
         """
-        self.variation.prepare(self.transport)
+        self.derivatives.prepare(self.transport)
         if self.geometry.inclusions is not None:
             self.geometry.inclusions.check_held()
         if self.textured is None or self.transport is None or self.is_mixed:
@@ -367,7 +367,7 @@ class TranslucentObject:
         if textured is not None and self.textured is None:  # its textures are the same everywhere
             with dr.resume_grad():
                 same = same and not textured.is_followed(shape)
-        return same and self.surface.spec is self.variation.spec and self.geometry.is_current()
+        return same and self.surface.spec is self.derivatives.spec and self.geometry.is_current()
 
 
 class KnowsUnit(abc.ABC):

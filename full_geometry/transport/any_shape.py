@@ -168,8 +168,8 @@ class NeuralShape:
         numbers = [medium(obj, c, mixture) for c, mixture in enumerate(mixtures)]
         return cls(obj, Backbone(obj, mixtures, precise), weights, numbers, precise=precise)
 
-    def beside(self, media: Sequence[Medium]) -> NeuralShape:
-        """See `surface.variation.Neighboured`; s by the walks and pairs that this one was held to."""
+    def perturbed(self, media: Sequence[Medium]) -> NeuralShape:
+        """See `surface.medium_derivatives.PerturbableTransport`; s by the walks and pairs that this one was held to."""
         near = NeuralShape.of(replace(self.object, media=tuple(media)), self.weights, True)
         return replace(near, scales=self.held.scales(near) if self.scales else ())
 

@@ -70,8 +70,8 @@ class HalfSpaceTransport:
         values = [mi.Float(model.eval(*asked)) for model in self.models]
         return dr.select(above, mi.Spectrum(*values) if len(values) > 1 else mi.Spectrum(values[0]), 0)
 
-    def beside(self, media: Sequence[Medium]) -> HalfSpaceTransport:
-        """See `variation.Neighboured`."""
+    def perturbed(self, media: Sequence[Medium]) -> HalfSpaceTransport:
+        """See `medium_derivatives.PerturbableTransport`."""
         models = [bssrdf(model.name, m) for model, m in zip(self.models, media)]
         return HalfSpaceTransport(models, self.geometry, True)
 

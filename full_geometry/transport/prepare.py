@@ -40,8 +40,8 @@ from full_geometry.objects.objects import (
 )
 from full_geometry.registry import AUTO, Choices, choices, lookup
 from full_geometry.settings import AUTOMATIC, Settings
+from full_geometry.surface.medium_derivatives import DifferentiableTransport, MediumDerivatives
 from full_geometry.surface.translucent import MediumSpec, check_boundary
-from full_geometry.surface.variation import Variation, VariedTransport
 from full_geometry.surface.varying import equivalent, warn_of_means
 from full_geometry.surface.wrapped import surface_of
 from full_geometry.transport.half_space import check_turns, half_space_model
@@ -102,7 +102,7 @@ def _make_object(geometry: Geometry, spec: MediumSpec, settings: Settings) -> Tr
     obj.wrapping.check(geometry)
     if geometry.inclusions is not None:
         _check_takes(geometry, spec, single_only)
-    variation = Variation(obj.surface, settings.mm_per_unit, spec.model)
+    derivatives = MediumDerivatives(obj.surface, settings.mm_per_unit, spec.model)
     if spec.orders == "total" and not single_only and (lookup(spec.model).of_half_space or spec.model == LAMBERT):
         check_turns(geometry, media, spec.model)
     none = ObjectModel(None, None)
@@ -110,11 +110,11 @@ def _make_object(geometry: Geometry, spec: MediumSpec, settings: Settings) -> Tr
     if transport and transport.orders == "total" and spec.orders == "multiple":
         raise ValueError(f"orders must be total for the model {spec.model!r}, which contains them all, got multiple")
     low_orders = _low_orders(spec, transport)
-    transport = VariedTransport(transport, variation) if hasattr(transport, "beside") else transport
+    transport = DifferentiableTransport(transport, derivatives) if hasattr(transport, "perturbed") else transport
     entries = entries if settings.entries == AUTOMATIC else settings.entries
     return replace(
         obj, transport=transport, proposals=proposals, entries=entries, low_orders=low_orders,
-        expected=expected_of(media), variation=variation,
+        expected=expected_of(media), derivatives=derivatives,
     )  # fmt: skip
 
 

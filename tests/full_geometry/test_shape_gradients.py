@@ -39,7 +39,7 @@ def test_as_much_light_leaves_by_a_medium_beside_as_by_its_walks() -> None:
         found, walked = [], []
         for k, side in enumerate((-h, h)):
             medium = {**MEDIUM, parameter: MEDIUM[parameter] + side}
-            found.append(np.log(model.held.spread(model.beside([Medium.from_albedo(**medium, eta=1.3)]))[0]))
+            found.append(np.log(model.held.spread(model.perturbed([Medium.from_albedo(**medium, eta=1.3)]))[0]))
             walked.append(_light(medium, 11 + k))
         (below, e_below), (above, e_above) = walked
         noise = np.sqrt(2) * np.hypot(e_below, e_above)  # that of the scores is as large

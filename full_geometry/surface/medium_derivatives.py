@@ -1,4 +1,4 @@
-"""How the light of an object varies with its medium: derivatives by albedo, extinction and mean cosine of a channel.
+"""Derivatives of S by the medium of an object: by albedo, extinction and mean cosine of a channel.
 
     dS/dtheta = S Σ_j c_j ln S(theta + h_j),    c_j = -+1/(2h) at h_j = -+h
 
@@ -31,11 +31,11 @@ STENCILS = (  # offsets of both sides over h; coefficients, of what is between t
 )
 
 
-class Neighboured(Transport, Protocol):
-    """A transport that knows media beside its own."""
+class PerturbableTransport(Transport, Protocol):
+    """A transport that can be made for a perturbed medium."""
 
-    def beside(self, media: Sequence[Medium]) -> Transport:
-        """That of the same object with a medium of each channel a little beside its own, 1/(scene unit).
+    def perturbed(self, media: Sequence[Medium]) -> Transport:
+        """The transport of the same object with a perturbed medium of each channel, 1/(scene unit).
 
         On CUDA it takes no half precision.
         """
@@ -43,10 +43,10 @@ class Neighboured(Transport, Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Stencil:
-    """Of one coefficient of the medium.
+    """Finite difference of ln S by one coefficient of the medium.
 
     Args:
-        sides: transports of neighbouring media.
+        sides: transports of the perturbed media.
         coefficients: of ln S of the transport itself and of both, by channel.
     """
 
@@ -64,8 +64,8 @@ class Stencil:
         return dr.select(least > 1e-35, S * by_logarithm, plain)
 
 
-class Variation:
-    """Of one object.
+class MediumDerivatives:
+    """Derivatives of S of one object by the parameters of its surface.
 
     Args:
         surface: its `translucent` BSDF, whose parameters are differentiated by.
@@ -84,7 +84,7 @@ class Variation:
             transport: of the object; None where no order from two on is asked for.
 
         Raises:
-            ValueError: the model has no derivatives, knows no medium beside its own, or g of an object with textures is
+            ValueError: the model has no derivatives or takes no perturbed medium, or g of an object with textures is
                 followed.
         """
         textured = self.spec.textured is not None  # which knows its derivatives but for g
@@ -104,7 +104,7 @@ class Variation:
 
     def _stencil(self, name: str, transport: Any) -> Stencil:
         places = [self._places(name, m) for m in self.spec.channels()]
-        sides = [transport.transport.beside(media) for media in zip(*(media for media, _ in places))]
+        sides = [transport.transport.perturbed(media) for media in zip(*(media for media, _ in places))]
         columns = zip(*(coefficients for _, coefficients in places))
         return Stencil(sides, [mi.Spectrum([opaque(c) for c in column]) for column in columns])
 
@@ -157,17 +157,17 @@ class Variation:
 
 
 @dataclass(frozen=True, eq=False)
-class VariedTransport(TransportAround):
-    """Another transport, a `Neighboured` one, with its derivatives by the medium.
+class DifferentiableTransport(TransportAround):
+    """A `PerturbableTransport` whose S has derivatives by the medium.
 
     Args:
-        variation: of its object.
+        derivatives: of its object.
     """
 
-    variation: Variation
+    derivatives: MediumDerivatives
 
     def prepare(self, at: SurfacePoint, active: mi.Bool = True) -> tuple[Any, SurfacePoint]:
-        """As of the transport, and the exit, for its neighbours."""
+        """As of the transport, and the exit, for transports of perturbed media."""
         return self.transport.prepare(at, active), at
 
     def S(self, exit: tuple[Any, SurfacePoint], at: SurfacePoint, active: mi.Bool = True) -> mi.Spectrum:
@@ -175,4 +175,4 @@ class VariedTransport(TransportAround):
         prepared, out = exit
         with dr.suspend_grad():
             S = self.transport.S(prepared, at, active)
-        return self.variation.S(S, out, at, active)
+        return self.derivatives.S(S, out, at, active)
