@@ -38,7 +38,7 @@ class SurfacePoint(NamedTuple):
         n_out: outward shading normal, as w sees it: see `lifted`.
         w: direction.
         sign: that turns geometric normals of the shape outwards.
-        medium: at the point, a `SurfaceMedium` in 1/(scene unit), of objects with textures.
+        medium: at the point, a `MediumAt` in 1/(scene unit), of objects with textures.
     """
 
     p: mi.Point3f

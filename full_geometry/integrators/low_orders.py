@@ -32,7 +32,7 @@ from full_geometry.geometry.rounding import blocked, clear, ray_from, ray_to
 from full_geometry.integrators.lighting import RenderContext, delta_light, mis_weight, sample_emitter
 from full_geometry.objects.objects import TranslucentObject
 from full_geometry.objects.small_emitters import WIDE
-from full_geometry.surface.textured import SurfaceMedium
+from full_geometry.surface.textured import MediumAt
 from halfspace_sss.physics.medium import eval_hg, sample_hg
 
 MOST_SEGMENTS = 256
@@ -96,7 +96,7 @@ class _Walk:
     reflections: mi.UInt32  # at the boundary, since the event
     left: mi.Bool
     alive: mi.Bool
-    medium: SurfaceMedium | tuple[()] = ()  # of the exit, of objects with textures
+    medium: MediumAt | tuple[()] = ()  # of the exit, of objects with textures
 
 
 # ---- The estimator ---------------------------------------------------------------------------------------------------
@@ -307,7 +307,7 @@ def _to_boundary(obj: TranslucentObject, walk: _Walk) -> tuple[tuple, mi.Float]:
     return (si, n_out, n), dr.maximum(si.t + dr.dot(walk.off, walk.d), 0)
 
 
-def _media(obj: TranslucentObject, medium: SurfaceMedium | tuple[()]) -> Media:
+def _media(obj: TranslucentObject, medium: MediumAt | tuple[()]) -> Media:
     """The medium of each channel: that of the exit, or of the object where it has no textures."""
     if not medium:
         return [tuple(opaque(v) for v in (m.sigma_s, m.sigma_t, m.g)) for m in obj.media]

@@ -50,7 +50,7 @@ from full_geometry.objects.inclusions import Inclusion, find_inclusions, place_o
 from full_geometry.registry import lookup
 from full_geometry.surface.medium_derivatives import MediumDerivatives
 from full_geometry.surface.spectral import MediumByWavelength
-from full_geometry.surface.textured import SurfaceMedium, TexturedMedium
+from full_geometry.surface.textured import MediumAt, TexturedMedium
 from full_geometry.surface.translucent import MediumSpec, check_boundary
 from full_geometry.surface.varying import VaryingMedium, equivalent
 from full_geometry.surface.wrapped import Wrapping, surface_of, wrapping_of
@@ -297,7 +297,7 @@ class TranslucentObject:
         """Extinction of each channel, 1/(scene unit), as data of kernels: one kernel serves all media."""
         return mi.Spectrum([opaque(m.sigma_t) for m in self.media])
 
-    def medium_at(self, si: mi.SurfaceInteraction3f) -> SurfaceMedium | tuple[()]:
+    def medium_at(self, si: mi.SurfaceInteraction3f) -> MediumAt | tuple[()]:
         """The medium at a point of its surface, where that has textures or spectra; else ()."""
         if self.spectral is not None:
             return self.spectral.at_exit(si)

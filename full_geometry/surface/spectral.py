@@ -19,7 +19,7 @@ import numpy as np
 
 from full_geometry.geometry.points import SurfacePoint, opaque
 from full_geometry.geometry.shape import Geometry
-from full_geometry.surface.textured import SurfaceMedium
+from full_geometry.surface.textured import MediumAt
 from halfspace_sss.materials.spectra import SpectralMedium, read_spectra
 from halfspace_sss.physics.medium import Medium
 
@@ -75,16 +75,16 @@ class MediumByWavelength:
         sigma_t, sigma_s, g = (mi.Spectrum(values) for values in results)
         return sigma_t * opaque(self.scale), sigma_s * opaque(self.scale), g
 
-    def at_exit(self, si: mi.SurfaceInteraction3f) -> SurfaceMedium:
+    def at_exit(self, si: mi.SurfaceInteraction3f) -> MediumAt:
         """The medium where light leaves, for its whole way."""
         sigma_t, sigma_s, g = self.at(si.wavelengths)
-        return SurfaceMedium(sigma_s / dr.maximum(sigma_t, 1e-30), sigma_t, si.prim_index, g, si.wavelengths)
+        return MediumAt(sigma_s / dr.maximum(sigma_t, 1e-30), sigma_t, si.prim_index, g, si.wavelengths)
 
-    def ends(self, obj: Geometry, exit: SurfacePoint, at: SurfacePoint, active: mi.Bool) -> list[SurfaceMedium]:
+    def ends(self, obj: Geometry, exit: SurfacePoint, at: SurfacePoint, active: mi.Bool) -> list[MediumAt]:
         """The medium by whose half-space light goes to an exit: the similar one of the mean g."""
         m = exit.medium
         albedo, sigma_t = self._similar(m.albedo, m.sigma_t, m.g)
-        return [SurfaceMedium(albedo, sigma_t, m.face)]
+        return [MediumAt(albedo, sigma_t, m.face)]
 
     def values_on(self, shape: mi.Shape) -> tuple[np.ndarray, np.ndarray]:
         """Albedo and sigma_t of that medium at the wavelengths of the tables, shapes (n, 1)."""

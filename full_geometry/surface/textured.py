@@ -101,7 +101,7 @@ def x_of_albedo(lib: Any, albedo: Any, g: Any, c: Any) -> Any:
 
 
 @dataclass
-class SurfaceMedium:
+class MediumAt:
     """The medium at a point of the surface, per channel, and the number of the face there."""
 
     albedo: mi.Spectrum
@@ -136,18 +136,18 @@ class TexturedMedium:
         """The same in other units of length: sigma_t times a factor."""
         return replace(self, scale=self.scale * factor)
 
-    def at(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> SurfaceMedium:
+    def at(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> MediumAt:
         """Albedo and sigma_t at a point of the surface."""
         sigma_t = self._extinction(self._value("sigma_t", si, active))
-        return SurfaceMedium(self.albedo_at(si, active), sigma_t, mi.UInt32(si.prim_index))
+        return MediumAt(self.albedo_at(si, active), sigma_t, mi.UInt32(si.prim_index))
 
     def at_point(
         self, obj: Geometry, p: mi.Point3f, n: mi.Normal3f, face: mi.UInt32 | None, active: mi.Bool = True
-    ) -> SurfaceMedium:
+    ) -> MediumAt:
         """The same at a point of an object with its outward normal and its face, if that is known."""
         return self.at(_interaction(obj, p, n, face, active), active)
 
-    def followed(self, obj: Geometry, at: SurfacePoint, active: mi.Bool = True) -> SurfaceMedium:
+    def followed(self, obj: Geometry, at: SurfacePoint, active: mi.Bool = True) -> MediumAt:
         """The medium at a point that knows it, with derivatives by texels and attributes where they are followed."""
         if not self.is_followed(obj.shape):
             return at.medium
@@ -155,9 +155,9 @@ class TexturedMedium:
         albedo, sigma_t = (
             dr.replace_grad(getattr(at.medium, key), getattr(found, key)) for key in ("albedo", "sigma_t")
         )
-        return SurfaceMedium(albedo, sigma_t, at.medium.face)
+        return MediumAt(albedo, sigma_t, at.medium.face)
 
-    def ends(self, obj: Geometry, exit: SurfacePoint, at: SurfacePoint, active: mi.Bool) -> list[SurfaceMedium]:
+    def ends(self, obj: Geometry, exit: SurfacePoint, at: SurfacePoint, active: mi.Bool) -> list[MediumAt]:
         """The media by whose half-spaces light goes from an entry to an exit: those of both ends, as `followed`."""
         return [self.followed(obj, end, active) for end in (exit, at)]
 

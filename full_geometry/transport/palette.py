@@ -49,7 +49,7 @@ from full_geometry.geometry.points import (
 from full_geometry.geometry.shape import Geometry
 from full_geometry.settings import Settings
 from full_geometry.surface.spectral import MediumByWavelength
-from full_geometry.surface.textured import SurfaceMedium, TexturedMedium, bend, x_of_albedo
+from full_geometry.surface.textured import MediumAt, TexturedMedium, bend, x_of_albedo
 from full_geometry.transport.half_space import HalfSpaceProposals, area_share, radial_table
 from halfspace_sss import measure
 from halfspace_sss.arrays import broadcast_query
@@ -198,7 +198,7 @@ class Palette:
         """Least power of the albedo in S."""
         return 1 if self.models[0].orders == "total" else 2
 
-    def S(self, ends: Sequence[SurfaceMedium], query: tuple[mi.Float, ...], active: mi.Bool) -> mi.Spectrum:
+    def S(self, ends: Sequence[MediumAt], query: tuple[mi.Float, ...], active: mi.Bool) -> mi.Spectrum:
         """sqrt(S_o S_i) of the media at both ends, or S of one, at a query in scene units, 1/((scene unit)² sr).
 
         With derivatives by the media where they are followed.
@@ -220,7 +220,7 @@ class Palette:
         return mi.Spectrum([value * (1 + each) for value, each in zip(result, change)])
 
     def _at_ends(
-        self, ends: Sequence[SurfaceMedium], query: tuple[mi.Float, ...], by_albedo: bool, by_sigma_t: bool,
+        self, ends: Sequence[MediumAt], query: tuple[mi.Float, ...], by_albedo: bool, by_sigma_t: bool,
         active: mi.Bool,
     ) -> tuple[mi.Spectrum, list[Slope]]:  # fmt: skip
         """S, and the slopes of each end and channel, 0 where they are not asked for.
@@ -303,7 +303,7 @@ class Palette:
         return model.eval(*query) * opaque(float(model.medium.albedo) ** -self.power)
 
     def _of_networks(
-        self, ends: Sequence[SurfaceMedium], query: tuple[mi.Float, ...], by_albedo: bool, by_sigma_t: bool,
+        self, ends: Sequence[MediumAt], query: tuple[mi.Float, ...], by_albedo: bool, by_sigma_t: bool,
         active: mi.Bool,
     ) -> tuple[mi.Spectrum, list[Slope]]:  # fmt: skip
         """As `_at_ends` by networks, which are asked at the distances of `_distances`."""
@@ -339,7 +339,7 @@ class Palette:
                 slopes.append(slope)
         return mi.Spectrum(result), slopes
 
-    def _distances(self, ends: Sequence[SurfaceMedium], r: mi.Float, by_sigma_t: bool) -> dict[int, Distances]:
+    def _distances(self, ends: Sequence[MediumAt], r: mi.Float, by_sigma_t: bool) -> dict[int, Distances]:
         """Where networks of each row are asked: at the distances of its channels, or at a few between all of these."""
         result = {}
         for first in self.networks:

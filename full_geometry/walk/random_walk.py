@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from full_geometry.geometry.points import SurfacePoint, channel_mean, evaluate, lift, sided, surface_point
-from full_geometry.surface.textured import SurfaceMedium
+from full_geometry.surface.textured import MediumAt
 from full_geometry.walk.media import Coefficients, WalkMedia, WalkMedium, ray_of
 from halfspace_sss.physics.medium import eval_hg, sample_hg
 from halfspace_sss.tracing.walk import ROULETTE_BOOST, ROULETTE_WEIGHT, generator, pass_seed
@@ -547,7 +547,7 @@ def _enter(
     d, _ = sided(si, bs.wo)
     medium: WalkMedium | tuple[()] = ()
     if media.carried:
-        of_exit = dr.gather(SurfaceMedium, start.medium, index, known)
+        of_exit = dr.gather(MediumAt, start.medium, index, known)
         lanes = dr.width(index)
         medium = replace(media.unknown(lanes), sigma_t=of_exit.sigma_t, sigma_s=of_exit.albedo * of_exit.sigma_t)
     walk = start_walk(si.p, d, rng, medium)
