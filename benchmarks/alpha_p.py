@@ -20,8 +20,8 @@ import mitsuba as mi
 import numpy as np
 import torch
 
-from figures.rivals.flow import N_CONTEXT, Chart, ConditionalFlow, FlowSampler, context, direction_square
-from figures.rivals.flow_training import FlowBatch, FlowNetwork, FlowRecipe, Walks, flow_walks, walk_batches
+from benchmarks.flow import N_CONTEXT, Chart, ConditionalFlow, FlowSampler, context, direction_square
+from benchmarks.flow_training import FlowBatch, FlowNetwork, FlowRecipe, Walks, flow_walks, walk_batches
 from full_geometry.geometry.points import SurfacePoint, opaque
 from full_geometry.learning.network_fitting import DenseLayers, PatchLogits
 from full_geometry.objects.objects import TranslucentObject

@@ -12,8 +12,8 @@ import mitsuba as mi
 import numpy as np
 import torch
 
-from figures.rivals.flow import Chart
-from figures.rivals.flow_training import FlowBatch, FlowRecipe, Lighting, likelihood_weights, walks_of
+from benchmarks.flow import Chart
+from benchmarks.flow_training import FlowBatch, FlowRecipe, Lighting, likelihood_weights, walks_of
 from full_geometry.geometry.points import cosine_above, opaque
 from full_geometry.learning.network_fitting import PatchLogits, patch_likelihood
 from full_geometry.objects.objects import TranslucentObject

@@ -13,9 +13,9 @@ import mitsuba as mi
 import numpy as np
 
 from benchmarks.alpha_p import fit_alpha_p
+from benchmarks.flow import FlowProposals
+from benchmarks.flow_training import FlowRecipe, Lighting, fit_flow
 from benchmarks.lightings import LIGHTINGS, fit_patches, lighting
-from figures.rivals.flow import FlowProposals
-from figures.rivals.flow_training import FlowRecipe, Lighting, fit_flow
 from figures.rivals.paper_network import PaperNetwork, PaperRecipe, estimate, fit_paper
 from full_geometry.geometry.points import (
     ObjectModel,

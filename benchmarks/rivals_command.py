@@ -67,8 +67,8 @@ def _made(
     from tempfile import TemporaryDirectory
 
     from benchmarks import rivals
+    from benchmarks.flow_training import FlowRecipe
     from benchmarks.rivals import sampler_table
-    from figures.rivals.flow_training import FlowRecipe
     from full_geometry.learning.training import train_by_cpu
     from full_geometry.objects.objects import object_of
 

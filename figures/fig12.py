@@ -19,18 +19,17 @@ from halfspace_sss.neural.store import weights_in
 
 TITLE = "one sample a pixel, with and without sampling that has learnt"
 SIZES = {"draft": 128, "paper": 384}
-SECONDS = {"draft": 6, "paper": 60}  # CPU time of the training, and of the flow
+SECONDS = {"draft": 6, "paper": 60}  # CPU time of the training
 REFERENCE_SPP = {"draft": 128, "paper": 512}
 LIGHTS = {"both": "lamp and windows", "small light": "small light"}  # under an even sky little is left to be drawn
 SHOWN = {"draft": ("small light",), "paper": tuple(LIGHTS)}
-SAMPLERS = ("probes", "patches", "flow")
+SAMPLERS = ("probes", "patches")
 ENTRIES = (1, 8)  # points of entry of an exit
 NOTES = (
     "The same network in all images, one path a pixel; what differs is where points of entry are drawn: probes that "
-    "follow the half-space, learnt weights of patches, a flow inside patches. Of N entries of an exit one is followed. "
-    "Gathered light takes the sum over entries. "
-    "FLIP and relative squared error against many samples by patches, denoised by Open Image Denoise; FLIP below these "
-    "is between two halves of them."
+    "follow the half-space, or learnt weights of patches. Of N entries of an exit one is followed. Gathered "
+    "light takes the sum over entries. FLIP and relative squared error against many samples by patches, denoised by "
+    "Open Image Denoise; FLIP below these is between two halves of them."
 )
 
 
@@ -46,18 +45,17 @@ def rendered(task: Task) -> dict[str, Any]:
     """The images of all samplers and numbers of entries under all lights, by gathered light, and the converged ones."""
     prepare()
     p, results, done = task.params, {}, 0
-    folders, flow = _weights(task)
+    folders = _weights(task)
     total = len(p["lights"]) * (1 + len(SAMPLERS) * len(ENTRIES))
     for light in p["lights"]:
         with weights_in(folders["patches"]):
             long = reference_image(replace(task, folder=task.folder / _key(light)), _scene(p, light))
         results[_key(light, "converged")] = long["image"]
         results[_key(light, "halves")] = long["halves"]
-        results[_key(light, "gathered")] = _image(folders["patches"], p, light, 1, 1, 7, gathered=True)
+        results[_key(light, "gathered")] = _image(folders["patches"], p, light, 1, gathered=True)
         for sampler in SAMPLERS:
             for n in ENTRIES:
-                drawn = flow if sampler == "flow" else None
-                results[_key(light, sampler, n)] = _image(folders[sampler], p, light, n, 1, 7, drawn)
+                results[_key(light, sampler, n)] = _image(folders[sampler], p, light, n)
                 done += 1
                 task.progress(done, total)
     return results
@@ -68,40 +66,30 @@ def _key(*words: object) -> str:
     return "-".join(str(word).replace(" ", "_") for word in words)
 
 
-def _weights(task: Task) -> tuple[dict[str, Path], dict[str, np.ndarray]]:
-    """A folder of weights for each sampler, of one training, without patches and with them; and those of a flow."""
-    from figures.rivals.flow_training import FlowRecipe, fit_flow
+def _weights(task: Task) -> dict[str, Path]:
+    """A folder of weights for each sampler, of one training, without patches and with them."""
     from full_geometry.learning.training import train_by_cpu
     from full_geometry.objects.objects import object_of
     from full_geometry.transport.storing import CENTRES, KIND
     from halfspace_sss.neural.store import load_weights, save_weights
 
-    p, folders = task.params, {name: task.folder / name for name in ("probes", "patches")}
+    p, folders = task.params, {name: task.folder / name for name in SAMPLERS}
     obj = object_of(*shape_of("bunny", task.folder))
-    learnt, path = train_by_cpu(obj, p["seconds"], folders["patches"], seed=p["seed"])
+    _, path = train_by_cpu(obj, p["seconds"], folders["patches"], seed=p["seed"])
     arrays, record = load_weights(path, KIND)
-    flow = fit_flow(learnt, FlowRecipe(seconds=p["seconds"]), seed=p["seed"]).flow.weights
     of_patches = {CENTRES} | {name for name in arrays if name.startswith(("V_", "c_"))}
     bare = {name: value for name, value in arrays.items() if name not in of_patches}
     save_weights(folders["probes"] / path.name, KIND, bare, record)
-    halves = {name: value.astype(np.float16) for name, value in flow.items()}  # as weights are kept
-    return {**folders, "flow": folders["patches"]}, halves
+    return folders
 
 
-def _image(
-    folder: Path, p: Mapping[str, Any], light: str, entries: int, spp: int, seed: int, flow: Any = None,
-    gathered: bool = False,
-) -> np.ndarray:  # fmt: skip
-    """The image with the weights of a folder; entries by a flow if its weights are given, or light gathered."""
+def _image(folder: Path, p: Mapping[str, Any], light: str, entries: int, gathered: bool = False) -> np.ndarray:
+    """The image of one path a pixel with the weights of a folder, light sampled or gathered."""
     import mitsuba as mi
-
-    from figures.rivals.flow import draw_by
 
     with weights_in(folder):
         scene = _scene(p, light, entries, "gathered" if gathered else "sampled")
-        if flow is not None:
-            draw_by(scene, flow)
-        return np.array(mi.render(scene, spp=spp, seed=seed), dtype=np.float32)
+        return np.array(mi.render(scene, spp=1, seed=7), dtype=np.float32)
 
 
 def _scene(p: Mapping[str, Any], light: str, entries: int = 1, gathering: str = "sampled") -> Any:

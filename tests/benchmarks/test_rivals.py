@@ -22,11 +22,11 @@ from waxen import BUNNY, WAX, random_layers, random_patches, wax_bunny  # noqa: 
 from benchmarks import rivals  # noqa: E402
 from benchmarks.__main__ import app  # noqa: E402
 from benchmarks.alpha_p import AlphaP, fit_alpha_p  # noqa: E402
+from benchmarks.flow import N_CONTEXT, Chart, ConditionalFlow, FlowSampler  # noqa: E402
+from benchmarks.flow_training import FlowNetwork, FlowRecipe  # noqa: E402
 from benchmarks.lightings import LIGHTINGS, lighting  # noqa: E402
 from benchmarks.rivals_command import _errors_wide  # noqa: E402
 from benchmarks.tables import markdown  # noqa: E402
-from figures.rivals.flow import N_CONTEXT, Chart, ConditionalFlow, FlowSampler  # noqa: E402
-from figures.rivals.flow_training import FlowNetwork, FlowRecipe  # noqa: E402
 from full_geometry.geometry.points import EntrySample  # noqa: E402
 from full_geometry.learning.model_errors import LIGHTS, reference  # noqa: E402
 from full_geometry.learning.network_fitting import Recipe  # noqa: E402

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -422,18 +422,3 @@ class FlowProposals(CosineProposals):
         weight = dr.select(active & (density > 0), 1 / density, 0)
         n = mi.Normal3f(at.n * opaque(self.sign))
         return EntrySample(mi.Point3f(at.p), n, mi.Normal3f(n_out), weight, mi.UInt32(at.prim_index))
-
-
-def draw_by(scene: mi.Scene, flow: Mapping[str, np.ndarray]) -> None:
-    """Let the entries of the learnt object of a scene be drawn by a flow inside its patches.
-
-    Args:
-        scene: with one `translucent` object, of the model `full_geometry`.
-        flow: weights of a `ConditionalFlow`, those of `fit_flow` for the object.
-    """
-    objects = scene.integrator().prepare(scene)
-    (obj,) = objects
-    patches: PatchSampler = obj.proposals.patches
-    chart = Chart(obj.transport.object, patches.frame, patches.patches)
-    sampler = FlowSampler(patches, chart, ConditionalFlow(2, flow))
-    objects[0] = replace(obj, proposals=FlowProposals(sampler, obj.geometry.sign, PatchTable(patches)))

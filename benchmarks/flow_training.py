@@ -15,7 +15,7 @@ import torch
 import zuko
 from torch import nn
 
-from figures.rivals.flow import (
+from benchmarks.flow import (
     BINS,
     LEAST_SLOPE,
     N_CONTEXT,

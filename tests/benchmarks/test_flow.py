@@ -5,9 +5,6 @@ Chi-square tests fail at 1e-3, with fixed seeds.
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -17,38 +14,24 @@ dr = pytest.importorskip("drjit")
 torch = pytest.importorskip("torch")
 pytest.importorskip("zuko")
 
-from waxen import BUNNY, random_layers, random_patches, wax_bunny  # noqa: E402
+from waxen import random_patches, wax_bunny  # noqa: E402
 
-from figures.rivals.flow import (  # noqa: E402  # noqa: E402  # noqa: E402
+from benchmarks.flow import (  # noqa: E402  # noqa: E402  # noqa: E402
     N_CONTEXT,
     Chart,
     ConditionalFlow,  # noqa: E402
     FlowProposals,
     FlowSampler,
     direction_square,
-    draw_by,
 )
-from figures.rivals.flow_training import FlowNetwork  # noqa: E402
+from benchmarks.flow_training import FlowNetwork  # noqa: E402
 from full_geometry.geometry.points import SurfacePoint  # noqa: E402
-from full_geometry.scenes.scene_files import load_scene  # noqa: E402
 from full_geometry.transport.features import (  # noqa: E402
     PreparedExit,
     Side,
-    Terms,
     first_event,  # noqa: E402
-    n_pair,
-    n_side,
 )
-from full_geometry.transport.patches import LearntProposals, PatchTable, cluster, mesh_faces  # noqa: E402
-from full_geometry.transport.storing import (  # noqa: E402
-    CENTRES,
-    CHECKSUMS,
-    ENDS,
-    TRUSTED,
-    TURNS,
-    identify,  # noqa: E402
-    save,
-)
+from full_geometry.transport.patches import LearntProposals, PatchTable, mesh_faces  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -224,38 +207,3 @@ def test_proposals_of_the_flow_and_of_patches_give_the_same_estimate(sampler: Fl
     for a, b in ((0, 1), (0, 2), (1, 2)):
         assert abs(means[a] - means[b]) < 4 * np.hypot(errors[a], errors[b])
     assert max(errors) < 0.03 * means[0]
-
-
-def test_a_scene_draws_by_a_flow(sampler: FlowSampler, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = load_scene(_wax_scene(sampler, tmp_path, monkeypatch), "full_geometry")
-    by_patches = np.array(mi.render(scene, spp=64, seed=1)).mean()
-    draw_by(scene, sampler.flow.weights)
-    (body,) = scene.integrator().prepare(scene)
-    assert isinstance(body.proposals, FlowProposals)
-    assert np.array(mi.render(scene, spp=64, seed=1)).mean() == pytest.approx(by_patches, rel=0.2)
-
-
-def _wax_scene(sampler: FlowSampler, folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """The bunny under a sky, with random weights of its own where renders find them."""
-    obj, frame = sampler.chart.object, sampler.frame
-    rng, n = np.random.default_rng(6), 2 * (n_side(3) + 5) + n_pair(3)
-    arrays = {
-        "W_0": 0.01 * rng.standard_normal((3, n)),
-        "b_0": np.zeros(3),
-        CENTRES: cluster(obj, frame, N_PATCHES),
-    }
-    arrays |= {TRUSTED: np.zeros((2, 3)), **random_layers(rng, "A", "a", [n_side(3), 5, 6])}
-    arrays = {name: value.astype(np.float16) for name, value in {**arrays, **sampler.patches.weights}.items()}
-    arrays |= {TURNS: frame.around.turns, ENDS: np.zeros((3, len(Terms.of(n_side(3)).rows)))}
-    save(folder, identify(obj), arrays, {"recipe": {"base_model": "better_dipole"}, CHECKSUMS: []})
-    monkeypatch.setenv("HALFSPACE_SSS_WEIGHTS", str(folder))
-    box = obj.geometry.shape.bbox()
-    centre, radius = np.array(box.center()).ravel(), np.linalg.norm(np.array(box.extents()).ravel()) / 2
-    view = mi.ScalarTransform4f().look_at(list(centre + [0, 0, 4 * radius]), list(centre), [0, 1, 0])
-    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
-    wax = {"type": "translucent", "sigma_s": "0.95,0.8,0.6", "sigma_a": "0.05,0.2,0.4", "g": 0.0, "eta": 1.4}
-    return {
-        "type": "scene", "light": {"type": "constant"}, "integrator": {"type": "bssrdf", "hide_emitters": True},
-        "sensor": {"type": "perspective", "fov": 28.0, "to_world": view, "film": film},
-        "bunny": {"type": "ply", "filename": str(BUNNY), "bsdf": {**wax, "model": "neural"}},
-    }  # fmt: skip
