@@ -28,7 +28,7 @@ LARGEST = 1e4  # no weight of a network that works is as large
 
 
 def to_json(content: dict[str, Any]) -> str:
-    """The text of a JSON file; NumPy's numbers become Python's.
+    """The text of a JSON file with one line for each key; NumPy's numbers become Python's.
 
     Raises:
         TypeError: something in it has no form in JSON.
@@ -39,7 +39,8 @@ def to_json(content: dict[str, Any]) -> str:
             return value.item()
         raise TypeError(f"content must be ready for JSON, got {value!r}")
 
-    return json.dumps(content, indent=1, default=plain) + "\n"
+    lines = (f" {json.dumps(key)}: {json.dumps(value, default=plain)}" for key, value in content.items())
+    return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
 def _record_path(path: Path) -> Path:
