@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import typer
 
+import figures
 from benchmarks.ablation_command import ablation_command
 from benchmarks.inversion_command import inversion_command
 from benchmarks.rivals_command import rivals_command
@@ -11,10 +12,13 @@ from benchmarks.shapes_command import shapes_command
 from benchmarks.speeds_command import gathered_command, speeds_command
 from benchmarks.total_error_command import total_error_command
 from benchmarks.trade_check_command import check_command
+from figures.parts.command import figures_command
 from halfspace_sss.cli.shared import Commands, with_quiet
 
+figures.ADDED |= {"equal_error": "benchmarks.equal_error", "trade": "benchmarks.trade_figure"}
 COMMANDS = {
     "ablation": ablation_command,
+    "figures": figures_command,
     "gathered": gathered_command,
     "inversion": inversion_command,
     "rivals": rivals_command,

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from figures.beyond.objects import VIEWS
+from benchmarks import equal_error_tables
 from figures.computing.contenders import (
     MODELS,
     OF_OBJECTS,
@@ -33,9 +33,9 @@ from figures.computing.learnt import (
     weight_files,
     with_weights,
 )
+from figures.computing.modelled import VIEWS
 from figures.computing.scenes import BUNNY, MATERIALS, SCANS, prepare
 from figures.computing.timed import TimedRender, alternating, rendered
-from figures.drawing import error_tables
 from figures.modelling.objects import TISSUES, VARYING, tissue
 from figures.parts.part import Part, Result, Task, unmodelled
 from halfspace_sss import materials
@@ -283,14 +283,14 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
         return {key: results[name].numbers for key, name in names.items() if name in results}
 
     tables = {
-        "errors": error_tables.equal_error(numbers(scenes)),
-        "sampling": error_tables.sampling(results["time per sample"].numbers["rows"]),
-        "furnace": error_tables.furnace(numbers(furnaces)),
+        "errors": equal_error_tables.equal_error(numbers(scenes)),
+        "sampling": equal_error_tables.sampling(results["time per sample"].numbers["rows"]),
+        "furnace": equal_error_tables.furnace(numbers(furnaces)),
     }
     files: dict[str, bytes | str] = {
         f"equal_error_{name}.csv": table.to_csv(index=False, lineterminator="\n") for name, table in tables.items()
     }
-    files["equal_error.md"] = error_tables.markdown(tables["errors"], tables["sampling"], tables["furnace"])
+    files["equal_error.md"] = equal_error_tables.markdown(tables["errors"], tables["sampling"], tables["furnace"])
     return files
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from figures.computing.contenders import VOLUMES, WALK, volume
+from figures.drawing.labels import in_markdown, label
 from figures.drawing.style import look
 
 if TYPE_CHECKING:
@@ -40,21 +41,11 @@ The models without surface reflection and without the single scattering that the
 best setting and at rr_depth 200."""
 
 
-def label(method: str) -> str:
-    """The name of a method as people read it."""
-    if method in VOLUMES:
-        kind, rr_depth = method.split()
-        return f"Mitsuba {kind}, roulette from {rr_depth}"
-    if method == WALK:
-        return "Our walk"
-    return "Neural half-space" if method == "neural" else look(method).label
-
-
 def equal_error(scenes: Mapping[tuple[str, str], Mapping[str, Any]]) -> pandas.DataFrame:
     """A row for each scene and method.
 
     Args:
-        scenes: (material, lights) -> what `figures.beyond.equal_error.measured` gave.
+        scenes: (material, lights) -> what `benchmarks.equal_error.measured` gave.
     """
     import pandas
 
@@ -186,18 +177,3 @@ def _furnace(rows: pandas.DataFrame, names: Sequence[str]) -> str:
         excess=[f"{v:+.4f}" for v in rows["excess"]],
     )
     return in_markdown(table)
-
-
-def in_markdown(table: pandas.DataFrame) -> str:
-    """A table in Markdown, numbers with three digits."""
-    lines = [list(table.columns), ["---"] * len(table.columns)]
-    lines += [[_said(value) for value in row] for row in table.itertuples(index=False)]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
-def _said(value: Any) -> str:
-    if isinstance(value, str):
-        return value
-    if not np.isfinite(value):
-        return "—"
-    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"

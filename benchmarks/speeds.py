@@ -20,10 +20,10 @@ import numpy as np
 import pandas
 
 from benchmarks.hand_and_ribbon import SHAPES
-from figures.beyond.objects import VIEWS
 from figures.computing.contenders import WALK, ready, volume
 from figures.computing.images import cover
 from figures.computing.learnt import object_parts
+from figures.computing.modelled import VIEWS
 from figures.computing.scenes import SCANS, prepare, scan_scene, surroundings
 from figures.computing.timed import TimedRender, alternating, rendered
 from figures.modelling.objects import VARYING, tissue

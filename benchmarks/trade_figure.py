@@ -11,13 +11,13 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from benchmarks.trade_tables import markdown, multiples, trade_table
 from figures.computing.contenders import OF_OBJECTS
 from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training_of, weight_files, with_weights
 from figures.computing.scenes import BUNNY, MM_PER_UNIT, bunny_scene, prepare
-from figures.drawing import trade_plot
 from figures.drawing.page import page
 from figures.drawing.style import paper, saved
-from figures.drawing.trade_plot import image_shots, multiples
+from figures.drawing.trade_plot import image_shots
 from figures.modelling.closed_shapes import write_shape
 from figures.parts.part import Part, Result, Task
 from full_geometry.scenes.scene_files import PATH_TRACED
@@ -113,7 +113,7 @@ def measured(task: Task) -> dict[str, Any]:
 
 def turned(task: Task) -> dict[str, Any]:
     """What the knobs bring on a scene."""
-    from figures.computing.knobs import channel_settings, entry_settings, node_settings, precision_settings
+    from benchmarks.knobs import channel_settings, entry_settings, node_settings, precision_settings
     from full_geometry.trade.ways import stage
     from halfspace_sss.neural.symmetric import channels
 
@@ -159,13 +159,13 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
         shown = enumerate(results[name].numbers["shown"])
         images = {way: np.asarray(results[name].images[f"image_{k}"]) for k, way in shown}
         shots[name] = image_shots(images, assessment)
-    table = trade_plot.trade_table(result)
+    table = trade_table(result)
     with paper():
         figure = multiples(result, TOLERANCE)
         files: dict[str, bytes | str] = {f"trade.{ending}": data for ending, data in saved(figure).items()}
     files["trade.csv"] = table.to_csv(index=False, lineterminator="\n", float_format="%.5g")
     knobs = [result.numbers["settings"] for name, result in results.items() if name.endswith(", knobs")]
     seconds = max(results[name].numbers["seconds"] for name in shots)
-    files["trade.md"] = trade_plot.markdown(result, seconds, [s for settings in knobs for s in settings])
+    files["trade.md"] = markdown(result, seconds, [s for settings in knobs for s in settings])
     files["trade.html"] = page("Speed against accuracy", shots)
     return files

@@ -41,13 +41,14 @@ from importlib.metadata import entry_points
 __all__ = ["FIGURES", "figure_modules"]
 
 OF_PAPER = ("fig01", "fig03", "fig05", "fig06", "fig07", "fig08", "fig09", "fig10", "fig11", "fig12", "table1")
-BEYOND = ("spheres", "thin", "textures", "gathered", "scenes", "equal_error", "objects", "trade")
+BEYOND = ("spheres", "thin", "textures", "gathered", "scenes")
 FIGURES = (*OF_PAPER, *BEYOND)
 GROUP = "halfspace_sss.figure_modules"
+ADDED: dict[str, str] = {}  # name -> module of figures that a program adds, as `benchmarks` does
 
 
 def figure_modules() -> dict[str, str]:
     """The module of each figure by its name, those of other packages last; a name that is taken is not given anew."""
-    added = {entry.name: entry.value for entry in entry_points(group=GROUP)}
+    added = {entry.name: entry.value for entry in entry_points(group=GROUP)} | ADDED
     own = {name: f"figures.{'beyond.' if name in BEYOND else ''}{name}" for name in FIGURES}
     return own | {name: module for name, module in added.items() if name not in own}

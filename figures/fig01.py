@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from figures.beyond.objects import VIEWS, View, foot, scene
 from figures.computing.contenders import OF_OBJECTS
 from figures.computing.images import Shot
 from figures.computing.learnt import (
@@ -20,11 +19,12 @@ from figures.computing.learnt import (
     weight_files,
     with_weights,
 )
+from figures.computing.modelled import VIEWS, View, foot, scene
 from figures.computing.references import NOTE, against, reference_image, reference_shot
 from figures.computing.scenes import environment_file, prepare
 from figures.computing.timed import COMPILING
-from figures.drawing.error_tables import label
 from figures.drawing.image_files import image_files, rows_of
+from figures.drawing.labels import label
 from figures.modelling.objects import TISSUES, tissue
 from figures.parts.part import Part, Result, Task
 

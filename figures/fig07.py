@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from figures.beyond.objects import VIEWS, View, foot, scene
 from figures.computing.images import Shot
 from figures.computing.learnt import (
     CHUNKS,
@@ -18,6 +17,7 @@ from figures.computing.learnt import (
     train_modelled,
     training_of,
 )
+from figures.computing.modelled import VIEWS, View, foot, scene
 from figures.computing.references import NOTE, against, reference_shot
 from figures.computing.scenes import environment_file, prepare
 from figures.drawing.image_files import image_files

@@ -13,7 +13,7 @@ from figures import fig07
 from figures.computing.contenders import OF_OBJECTS
 from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training_of, weight_files
 from figures.computing.scenes import BUNNY, MATERIALS
-from figures.drawing.error_tables import in_markdown, label
+from figures.drawing.labels import in_markdown, label
 from figures.fig09 import LIGHTS, rendered
 from figures.parts.part import Part, Result
 from halfspace_sss import materials

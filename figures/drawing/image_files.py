@@ -9,8 +9,8 @@ import numpy as np
 
 from figures.computing.images import FLIP, Shot
 from figures.computing.references import against, reference_shot
-from figures.drawing.error_tables import label
 from figures.drawing.image_grid import image_grid
+from figures.drawing.labels import label
 from figures.drawing.page import page
 from figures.drawing.style import paper, saved
 from figures.parts.part import Result

@@ -68,18 +68,18 @@ class Grid:
         return {name: mi.VolumeGrid(np.ascontiguousarray(v, dtype=np.float32)) for name, v in arrays.items()}
 
     def write(self, folder: Path, name: str) -> dict[str, Any]:
-        """Write FOLDER/NAME_sigma_t.vol and ..._albedo.vol, and return the `heterogeneous` medium that reads them."""
+        """Write FOLDER/NAME_sigma_t.vol and ..._albedo.vol, and return the volumes that read them, by name."""
         import mitsuba as mi
 
         low, high = np.array(self.box.low), np.array(self.box.high)
         to_world = mi.ScalarTransform4f().translate(low.tolist()).scale((high - low).tolist())
-        medium: dict[str, Any] = {"type": "heterogeneous"}
+        volumes = {}
         for key, volume in self.volumes().items():
             path, stream = Path(folder) / f"{name}_{key}.vol", mi.MemoryStream()
             volume.write(stream)
             write_atomically(path, bytes(stream.raw_buffer()))
-            medium[key] = {"type": "gridvolume", "filename": str(path), "to_world": to_world}
-        return medium
+            volumes[key] = {"type": "gridvolume", "filename": str(path), "to_world": to_world}
+        return volumes
 
 
 def mixed(tissues: Tissues, box: Box, resolution: int) -> Grid:
@@ -118,7 +118,6 @@ def _coefficients(shares: Mapping[str, np.ndarray]) -> np.ndarray:
 VARYING = ("mandarin", "meat", "croissant")
 OBJECTS = ("candle", *VARYING)
 FLAME_RADIANCE = (60.0, 30.0, 8.5)
-ROUGHNESS = {"mandarin": 0.22, "meat": 0.2, "croissant": 0.5}  # alpha of the boundary, chosen
 ETA = {"mandarin": 1.36, "meat": 1.4, "croissant": 1.3}
 _MODELS = {
     "mandarin": (varying.Mandarin, varying.MANDARIN_BOX),
@@ -129,13 +128,12 @@ _MODELS = {
 
 @dataclass(frozen=True, eq=False)
 class Varying:
-    """An object whose medium varies: its surface, the medium, the relative index and roughness of its boundary."""
+    """An object whose medium varies: its surface, the medium, the relative index of its boundary."""
 
     name: str
     mesh: Mesh
     grid: Grid
     eta: float
-    alpha: float
 
 
 def make_varying(name: str, resolution: int = 192, grid_resolution: int = 160, seed: int = 0) -> Varying:
@@ -155,7 +153,7 @@ def make_varying(name: str, resolution: int = 192, grid_resolution: int = 160, s
     make, box = _MODELS[name]
     result = make(seed)
     mesh, grid = surface(result.distance, box, resolution), mixed(result.tissues, box, grid_resolution)
-    return Varying(name, mesh, grid, ETA[name], ROUGHNESS[name])
+    return Varying(name, mesh, grid, ETA[name])
 
 
 def candle_parts(folder: Path, resolution: int = 192, seed: int = 0, model: str = "neural") -> dict[str, Any]:
@@ -181,19 +179,6 @@ def candle_parts(folder: Path, resolution: int = 192, seed: int = 0, model: str 
     }
 
 
-def varying_parts(result: Varying, folder: Path) -> dict[str, Any]:
-    """An object whose medium varies, as a rough dielectric about Mitsuba's `heterogeneous` medium; mm.
-
-    Args:
-        result: the object.
-        folder: where its PLY file and its grid volumes are written.
-    """
-    path = result.mesh.write_ply(Path(folder) / f"{result.name}.ply")
-    boundary = {"type": "roughdielectric", "alpha": result.alpha, "int_ior": result.eta, "ext_ior": 1.0}
-    medium = result.grid.write(Path(folder), result.name)
-    return {result.name: {"type": "ply", "filename": str(path), "bsdf": boundary, "interior": medium}}
-
-
 def learnable_parts(result: Varying, folder: Path, model: str = "full_geometry") -> dict[str, Any]:
     """An object whose medium varies with the surface `translucent` and a smooth boundary, so that it can be learnt; mm.
 
@@ -202,7 +187,7 @@ def learnable_parts(result: Varying, folder: Path, model: str = "full_geometry")
         folder: where its PLY file and its grid volumes are written.
         model: of light in it.
     """
-    parts = varying_parts(result, folder)[result.name]
-    grids = {key: parts["interior"][key] for key in ("sigma_t", "albedo")}
+    path = result.mesh.write_ply(Path(folder) / f"{result.name}.ply")
+    grids = result.grid.write(Path(folder), result.name)
     surface = {"type": "translucent", "model": model, "g": 0.0, "eta": result.eta, **grids}
-    return {result.name: {"type": "ply", "filename": parts["filename"], "bsdf": surface}}
+    return {result.name: {"type": "ply", "filename": str(path), "bsdf": surface}}

@@ -28,7 +28,7 @@ from halfspace_sss.checks import check_choice, check_interval
 from halfspace_sss.interface.model import no_models
 from halfspace_sss.progress import Progress
 
-PACKAGES = ("figures", "full_geometry", "analytic_models", "halfspace_sss")
+PACKAGES = ("benchmarks", "figures", "full_geometry", "analytic_models", "halfspace_sss")
 MACHINERY = "figures.parts"  # keeps and orders what parts compute, and computes nothing of it
 RENDERS = "full_geometry.registry"  # is imported by all that finds models of objects
 NAMES = "halfspace_sss.extensions"  # knows the names of packages, and asks for none of what they offer

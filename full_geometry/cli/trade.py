@@ -94,7 +94,7 @@ def _shipped() -> None:
         table = pandas.read_csv(path)
     screen = console()
     screen.print(_rich(["material", "shape", "light", *_HEADINGS], [_shipped_row(row) for row in table.itertuples()]))
-    screen.print("measured by `halfspace-sss figures all trade`; docs/trade.md says how", highlight=False)
+    screen.print("measured by `python -m benchmarks figures all trade`; docs/trade.md says how", highlight=False)
 
 
 def _shipped_row(row: Any) -> list[str]:

@@ -10,12 +10,11 @@ import numpy as np
 import pandas
 import pytest
 
-from figures.beyond import equal_error
-from figures.beyond.equal_error import MODELLED, STEPS, furnace, furnace_models, modelled_contender, modelled_scene
+from benchmarks import equal_error, equal_error_tables
+from benchmarks.equal_error import MODELLED, STEPS, furnace, furnace_models, modelled_contender, modelled_scene
 from figures.computing.contenders import MODELS, VOLUMES, WALK, contender
 from figures.computing.scenes import MM_PER_UNIT, prepare
 from figures.computing.timed import TimedRender, rendered
-from figures.drawing import error_tables
 from figures.parts.part import Part, Result, Task
 from full_geometry.learning import training
 from full_geometry.learning.network_fitting import Recipe
@@ -134,7 +133,7 @@ def _table(*errors: tuple[str, float, float]) -> pandas.DataFrame:
         for name, variance, error in errors
     ]
     scene = {"rows": rows, "truth": {"mean square": 4.0}}
-    return error_tables.equal_error({("marble", "even sky"): scene}).set_index("method")
+    return equal_error_tables.equal_error({("marble", "even sky"): scene}).set_index("method")
 
 
 def test_what_the_noise_of_the_truth_hides_is_left_out() -> None:
@@ -161,8 +160,8 @@ def test_a_training_has_paid_once_the_images_have_saved_its_time() -> None:
         for name, variance in ((VOLUMES[0], 2.0), (DIPOLE, 0.5), (MODELS[1], 4.0))
     ]
     scene = {"rows": rows, "truth": {"mean square": 1000.0}, "training": {DIPOLE: 20.0, MODELS[1]: 20.0}}
-    table = error_tables.equal_error({("marble", "even sky"): scene}).set_index("method")
-    saved = (2.0 - 0.5) * 2.0 / (error_tables.WANTED**2 * 1000.0)  # seconds of an image of that noise
+    table = equal_error_tables.equal_error({("marble", "even sky"): scene}).set_index("method")
+    saved = (2.0 - 0.5) * 2.0 / (equal_error_tables.WANTED**2 * 1000.0)  # seconds of an image of that noise
     assert table.loc[DIPOLE, "images until paid"] == np.ceil(20.0 / saved) == 3
     assert np.isnan(table.loc[[VOLUMES[0], MODELS[1]], "images until paid"]).all()
 

@@ -10,10 +10,8 @@ igl = pytest.importorskip("igl")
 
 import mitsuba as mi  # noqa: E402
 
-from figures.beyond import objects as pictures  # noqa: E402
 from figures.computing import scenes  # noqa: E402
 from figures.modelling import candle, objects  # noqa: E402
-from figures.parts import runner  # noqa: E402
 from full_geometry.learning import meshes  # noqa: E402
 
 LOW, HIGH = 32, 64
@@ -165,16 +163,3 @@ def test_a_ply_file_holds_the_mesh_that_mitsuba_is_given(made: dict, tmp_path) -
 def test_an_environment_has_no_negative_pixel(chosen: str) -> None:
     mi.set_variant("llvm_ad_rgb")
     assert np.array(scenes.environment(chosen)["bitmap"]).min() >= 0
-
-
-@pytest.mark.slow
-def test_the_figure_shows_the_objects(monkeypatch, tmp_path) -> None:
-    pytest.importorskip("mitsuba_oidn")
-    for key, value in {"SIZES": 16, "SPP": 2, "RESOLUTION": 24}.items():
-        monkeypatch.setattr(pictures, key, {"draft": value})
-    monkeypatch.setattr(pictures, "OBJECTS", ("candle", "meat"))
-    results = runner.compute("objects", "draft", tmp_path)
-    for found in results.values():
-        assert found.images["denoised"].shape == (16, 16, 3) and found.images["image"].max() > 0.01
-    files = pictures.draw(results)
-    assert files["objects.png"][:4] == b"\x89PNG" and "<html" in files["objects.html"]

@@ -308,7 +308,7 @@ def test_the_choice_takes_its_share_of_the_samples_of_an_image(share: float, spp
 
 
 def test_half_precision_of_a_network_is_measured_beside_single() -> None:
-    from figures.computing.knobs import precision_settings
+    from benchmarks.knobs import precision_settings
 
     single, half = precision_settings(Medium.from_albedo(0.9, 1.0, 0.0, 1.3), events=2e5)
     assert (single.value, single.cost, half.value) == ("float32", 1.0, "float16")
@@ -402,7 +402,8 @@ def test_without_an_argument_the_shipped_table_is_shown() -> None:
 
 def test_the_figure_and_the_page_are_drawn() -> None:
     pytest.importorskip("matplotlib")
-    from figures.drawing.trade_plot import multiples, render
+    from benchmarks.trade_tables import multiples
+    from figures.drawing.trade_plot import render
     from full_geometry.trade.images import TradePicture
     from full_geometry.trade.results import Assessment, ObjectTrade, WayTrade
 
