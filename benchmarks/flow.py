@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.geometry.mesh import positions_at, vertices_of
 from full_geometry.geometry.points import CosineProposals, EntrySample, Point, SurfacePoint, opaque, turned
 from full_geometry.objects.objects import TranslucentObject
 from full_geometry.transport.features import ObjectFrame, PreparedExit, Side
@@ -91,8 +92,7 @@ class Chart:
 
     def coordinates(self, face: Any, p: Any) -> tuple[Any, Any]:
         """Coordinates in its patch of a point of a face."""
-        index = self.object.geometry.shape.face_indices(face)
-        a, b, c = (self.object.geometry.shape.vertex_position(i) for i in (index.x, index.y, index.z))
+        a, b, c = positions_at(self.object.geometry.shape, vertices_of(self.object.geometry.shape, face))
         ab, ac, ap = b - a, c - a, p - a
         n = dr.cross(ab, ac)
         square = dr.maximum(dr.squared_norm(n), 1e-38)

@@ -20,6 +20,7 @@ from figures.computing.images import mean_flip
 from figures.computing.scenes import BUNNY, MM_PER_UNIT
 from figures.rivals import deng
 from full_geometry import inverse
+from full_geometry.geometry.mesh import vertex_positions
 from full_geometry.inverse.views import GivenView
 from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
 from halfspace_sss.progress import NamedProgress
@@ -99,7 +100,7 @@ def _albedo(thing: str) -> np.ndarray:
         reflectance = bands()[0].reshape(TEXELS, TEXELS, -1, 3).mean(axis=2)
     else:
         mesh = mi.load_dict({"type": "ply", "filename": str(BUNNY)})
-        reflectance = mosaic(np.array(mi.traverse(mesh)["vertex_positions"], dtype=float).reshape(-1, 3))
+        reflectance = mosaic(vertex_positions(mesh).astype(float))
     return 1 - (1 - reflectance) ** 2
 
 

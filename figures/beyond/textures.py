@@ -71,8 +71,10 @@ def _bunny(folder: Path) -> dict[str, Any]:
     """The bunny with a mosaic as an attribute of its vertices."""
     import mitsuba as mi
 
+    from full_geometry.geometry.mesh import vertex_positions
+
     mesh = mi.load_dict({"type": "ply", "filename": str(BUNNY)})
-    p = np.array(mi.traverse(mesh)["vertex_positions"], dtype=float).reshape(-1, 3)
+    p = vertex_positions(mesh).astype(float)
     mesh.add_attribute("vertex_paint", 3, mosaic(p).astype(np.float32).ravel().tolist())
     path = folder / "painted.ply"
     mesh.write_ply(str(path))

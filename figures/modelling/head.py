@@ -98,13 +98,15 @@ def write_painted(mesh: Mesh, path: Path) -> dict[str, Any]:
     """The head as a shape of `mitsuba.load_dict`, its file written, and the paint as a texture: "shape" and "paint"."""
     import mitsuba as mi
 
+    from full_geometry.geometry.mesh import GEOMETRY, TEXCOORDS
+
     built = mi.Mesh(
         "head", len(mesh.vertices), len(mesh.faces), has_vertex_normals=True, has_vertex_texcoords=True
     )  # fmt: skip
     smooth, parameters = mi.traverse(mesh.mitsuba("smooth")), mi.traverse(built)
-    for key in ("vertex_positions", "vertex_normals", "faces"):
+    for key in GEOMETRY:
         parameters[key] = smooth[key]
-    parameters["vertex_texcoords"] = texture_coordinates(mesh.vertices).astype(np.float32).ravel()
+    parameters[TEXCOORDS] = texture_coordinates(mesh.vertices).astype(np.float32).ravel()
     parameters.update()
     built.write_ply(str(path))
     texels = np.ascontiguousarray(paint(), dtype=np.float32)

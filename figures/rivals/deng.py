@@ -30,6 +30,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from figures.rivals.photographs import Studio
+from full_geometry.geometry.mesh import face_vertices, vertex_positions
 from halfspace_sss.progress import Progress
 
 MODEL, ORDERS = "standard_dipole_normalized", "multiple"
@@ -119,12 +120,12 @@ def fit(
 
 def _texels(mesh: mi.Mesh, n: int, rng: np.random.Generator) -> np.ndarray:
     """The number of the texel of each vertex."""
-    points = np.array(mi.traverse(mesh)["vertex_positions"]).reshape(-1, 3)
+    points = vertex_positions(mesh)
     return cKDTree(points[rng.permutation(len(points))[:n]]).query(points)[1]
 
 
 def _edges(mesh: mi.Mesh) -> np.ndarray:
     """The numbers of the attribute at both ends of each edge of the faces, (2, 9 faces)."""
-    faces = np.array(mi.traverse(mesh)["faces"]).reshape(-1, 3)
+    faces = face_vertices(mesh)
     ends = np.stack([faces.ravel(), np.roll(faces, -1, axis=1).ravel()])
     return (3 * ends[..., None] + np.arange(3)).reshape(2, -1).astype(np.uint32)

@@ -19,6 +19,7 @@ import torch
 import zuko
 
 from figures.rivals.paper_network import placed
+from full_geometry.geometry.mesh import face_vertices, vertex_positions
 from full_geometry.geometry.points import SurfacePoint, channel_mean, cosine_above, place, surface_point
 from full_geometry.objects.objects import TranslucentObject
 from full_geometry.transport.features import ObjectFrame
@@ -161,11 +162,10 @@ def _pairs(
 
 def mesh_arrays(obj: TranslucentObject, frame: ObjectFrame) -> tuple[np.ndarray, np.ndarray]:
     """Vertices, in the frame over the radius, and faces, as libigl takes them."""
-    parameters = mi.traverse(obj.geometry.shape)
-    vertices = np.array(parameters["vertex_positions"], dtype=np.float64).reshape(-1, 3)
+    vertices = vertex_positions(obj.geometry.shape).astype(np.float64)
     turn = np.eye(3) if frame.turn is None else np.array([np.array(row).ravel() for row in frame.turn])
     centre, radius = np.array(frame.centre, dtype=float).ravel(), float(np.array(frame.radius).item())
-    faces = np.array(parameters["faces"], dtype=np.int64).reshape(-1, 3)
+    faces = face_vertices(obj.geometry.shape).astype(np.int64)
     return np.ascontiguousarray((vertices - centre) @ turn.T / radius), faces
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.geometry import mesh
 from full_geometry.geometry.snapshot import plain
 
 # a name says nothing of the image but that of an attribute, an address nothing of the scene, and how many samples are
@@ -50,7 +51,7 @@ def children(holder: Any) -> list[Any]:
 
 def object_digest(node: mi.Object) -> str:
     """SHA-256 of an object of Mitsuba, in words and by all its parameters."""
-    flipped = isinstance(node, mi.Shape) and node.has_flipped_normals()  # of which Mitsuba tells nothing in words
+    flipped = isinstance(node, mi.Shape) and mesh.is_flipped(node)  # of which Mitsuba tells nothing in words
     digest = hashlib.sha256(f"{words(node)}{flipped}".encode())
     for key, content in sorted((_MADE_UP.sub("", key), _content(value)) for key, value in mi.traverse(node).items()):
         digest.update(b"\0%s\0%d\0" % (key.encode(), len(content)))

@@ -25,6 +25,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.geometry import mesh
 from full_geometry.geometry.rounding import ray_from
 from full_geometry.geometry.shape import Geometry
 
@@ -603,12 +604,10 @@ class AreaPoints:
     def __init__(self, shape: mi.Shape) -> None:
         self.shape = shape
         self.faces = self.centre = self.light = None
-        parameters = mi.traverse(shape)
         if shape.class_name() == "Sphere":  # Mitsuba's normals of sampled points are wrong where it is mirrored
-            self.centre = np.array(parameters["to_world"].matrix, dtype=np.float64).reshape(4, 4)[:3, 3]
-        if "faces" in parameters:
-            faces = np.array(parameters["faces"]).reshape(-1, 3)
-            a, b, c = np.array(parameters["vertex_positions"]).reshape(-1, 3)[faces].transpose(1, 0, 2)
+            self.centre = np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)[:3, 3]
+        if mesh.has_faces(shape):
+            a, b, c = mesh.face_corners(shape, np.float32)
             self.areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
             self.faces = mi.DiscreteDistribution(mi.Float(self.areas.astype(np.float32)))
 
@@ -634,19 +633,19 @@ class AreaPoints:
 
     def _radial(self, p: mi.Point3f) -> Any:
         n = dr.normalize(p - mi.Point3f(*(opaque(c) for c in self.centre)))
-        return mi.Normal3f(-n if self.shape.has_flipped_normals() else n)
+        return mi.Normal3f(-n if mesh.is_flipped(self.shape) else n)
 
     def on_face(self, face: mi.UInt32, u: mi.Point2f, active: mi.Bool = True) -> Point:
         """A uniform point of a face of a mesh."""
-        index = self.shape.face_indices(face, active)
-        corners = [self.shape.vertex_position(i, active) for i in (index.x, index.y, index.z)]
+        vertices = mesh.vertices_of(self.shape, face, active)
+        corners = mesh.positions_at(self.shape, vertices, active)
         b = mi.warp.square_to_uniform_triangle(u)
         weights = (1 - b.x - b.y, b.x, b.y)
         n = dr.normalize(dr.cross(corners[1] - corners[0], corners[2] - corners[0]))
-        n = -n if self.shape.has_flipped_normals() else n
+        n = -n if mesh.is_flipped(self.shape) else n
         n_shading = n
         if self.shape.has_vertex_normals():
-            normals = [self.shape.vertex_normal(i, active) for i in (index.x, index.y, index.z)]
+            normals = mesh.normals_at(self.shape, vertices, active)
             n_shading = dr.normalize(sum(w * v for w, v in zip(weights, normals)))
         p = sum(w * c for w, c in zip(weights, corners))
         return Point(mi.Point3f(p), mi.Normal3f(n), mi.Normal3f(n_shading), face)

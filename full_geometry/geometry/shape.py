@@ -13,6 +13,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from full_geometry.geometry import mesh
 from full_geometry.geometry.rounding import bound_of, ray_from
 from full_geometry.geometry.snapshot import Snapshot
 
@@ -47,11 +48,9 @@ def faces_of(shape: mi.Shape, name: str) -> Faces | None:
     Raises:
         ValueError: a surface of the mesh, called `name`, has one side only, as a Möbius strip has.
     """
-    parameters = mi.traverse(shape)
-    if "faces" not in parameters:
+    if not mesh.has_faces(shape):
         return None
-    faces = np.array(parameters["faces"]).reshape(-1, 3)
-    positions = np.array(parameters["vertex_positions"], dtype=float).reshape(-1, 3)
+    faces, positions = mesh.face_vertices(shape), mesh.vertex_positions(shape).astype(float)
     _, place = np.unique(positions, axis=0, return_inverse=True)
     corners = place.reshape(-1)[faces]
     a, b, c = positions[faces].transpose(1, 0, 2)
@@ -86,19 +85,15 @@ def check_copies(faces: Faces, name: str) -> None:
 
 def face_normals_agree(shape: mi.Shape, faces: Faces, name: str) -> None:
     """Warn that faces were turned, and make vertex normals anew that were averaged over faces of both sides."""
-    parameters = mi.traverse(shape)
     turned = int(min((faces.sides < 0).sum(), (faces.sides > 0).sum()))
     more = ""
     if shape.has_vertex_normals():
-        vertex = np.array(parameters["faces"]).reshape(-1, 3)
-        positions = np.array(parameters["vertex_positions"], dtype=float).reshape(-1, 3)
+        vertex, positions = mesh.face_vertices(shape), mesh.vertex_positions(shape).astype(float)
         normals = faces.normals * faces.sides[:, None]
-        known = np.array(parameters["vertex_normals"], dtype=float).reshape(-1, 3)
+        known = mesh.vertex_normals(shape).astype(float)
         above = float((np.einsum("fkx,fx->fk", known[vertex], normals) > 0).mean())
         if min(above, 1 - above) > CREASES:
-            new = _vertex_normals(positions, vertex, normals)
-            parameters["vertex_normals"] = mi.Float(new.ravel().astype(np.float32))
-            parameters.update()
+            mesh.set_vertex_normals(shape, _vertex_normals(positions, vertex, normals))
             more = ", and vertex normals were made anew"
     warnings.warn(
         f"faces of object {name} point to both sides: {turned} of {len(faces.sides)} were turned{more}",
@@ -265,7 +260,7 @@ class Geometry:
     @property
     def curvature_sign(self) -> float:
         """-1 for a mesh with flip_normals, whose normals Mitsuba turns, but not their derivatives."""
-        return -1.0 if self.shape.is_mesh() and self.shape.has_flipped_normals() else 1.0
+        return -1.0 if self.shape.is_mesh() and mesh.is_flipped(self.shape) else 1.0
 
     def side(self, prim_index: mi.UInt32, active: mi.Bool = True) -> Any:
         """1 where the geometric normal of a face points outwards, -1 where it points inwards."""
@@ -330,7 +325,7 @@ def analyse_shape(shape: mi.Shape, world: mi.Scene | None = None, groups: Iterab
     )  # fmt: skip
 
 
-PLACES = ("to_world", "vertex_positions", "vertex_normals", "faces", "grid", "control_points", "data", "extent")
+PLACES = (*mesh.GEOMETRY, "to_world", "grid", "control_points", "data", "extent")
 
 
 def geometry_of(shape: mi.Shape) -> Snapshot:

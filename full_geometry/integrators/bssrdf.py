@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import drjit as dr
 import mitsuba as mi
 
+from full_geometry.geometry import mesh
 from full_geometry.geometry.instances import InstanceScene
 from full_geometry.geometry.sensors import (
     past_emitters,
@@ -36,7 +37,7 @@ from full_geometry.transport.prepare import TranslucentObjects, make_objects
 from halfspace_sss.interrupts import interruptible
 
 SAMPLES_PER_LAUNCH = 2**20  # half a second on 2 cores
-GEOMETRY = ("to_world", "vertex_positions", "vertex_normals", "vertex_texcoords")
+GEOMETRY = ("to_world", mesh.POSITIONS, mesh.NORMALS, mesh.TEXCOORDS)
 
 
 # ---- The plugin -----------------------------------------------------------------------------------------------------

@@ -34,6 +34,7 @@ import numpy as np
 from scipy.sparse import block_diag, csr_array, diags_array, hstack, kron, vstack
 from scipy.sparse.linalg import LinearOperator, cg
 
+from full_geometry.geometry import mesh
 from full_geometry.geometry.sensors import camera_rays
 from full_geometry.geometry.shape import name_of
 from full_geometry.inverse.comparing import (
@@ -184,7 +185,7 @@ class Variable:
         if shown(self.texture)[0][1].startswith("face_"):
             return np.array(si.prim_index, dtype=int)[None], np.ones((1, n))
         u, v = np.array(corner)
-        return np.array(shape.face_indices(si.prim_index), dtype=int), np.stack([1 - u - v, u, v])
+        return np.array(mesh.vertices_of(shape, si.prim_index), dtype=int), np.stack([1 - u - v, u, v])
 
     def _texels_at(self, si: mi.SurfaceInteraction3f) -> tuple[np.ndarray, np.ndarray]:
         """Of a bitmap, by what it shows of texels that are no neighbours: weights, and these times rows and columns."""
@@ -301,7 +302,7 @@ def _bounds(
 
 def _neighbours(shape: mi.Shape, attribute: str) -> np.ndarray:
     """Vertices that share an edge, or faces that do, shape (n, 2)."""
-    faces = np.array(mi.traverse(shape)["faces"], dtype=np.int64).reshape(-1, 3)
+    faces = mesh.face_vertices(shape).astype(np.int64)
     edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     if not attribute.startswith("face_"):
         return np.unique(edges, axis=0)

@@ -224,17 +224,15 @@ class Mesh:
         import igl
         import mitsuba as mi
 
+        from full_geometry.geometry.mesh import fill, set_vertex_normals
+
         props = mi.Properties()
         if bsdf is not None:
             props["mesh_bsdf"] = bsdf
         mesh = mi.Mesh(name, len(self.vertices), len(self.faces), props=props, has_vertex_normals=True)
-        parameters = mi.traverse(mesh)
-        parameters["vertex_positions"] = self.vertices.astype(np.float32).ravel()
-        parameters["faces"] = self.faces.astype(np.uint32).ravel()
-        parameters.update()
+        fill(mesh, self.vertices, self.faces)
         normals = igl.per_vertex_normals(self.vertices, self.faces, igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_ANGLE)
-        parameters["vertex_normals"] = normals.astype(np.float32).ravel()
-        parameters.update()
+        set_vertex_normals(mesh, normals)
         return mesh
 
     def write_ply(self, path: str | os.PathLike) -> Path:

@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.geometry import mesh
 from full_geometry.geometry.points import SurfacePoint, evaluate
 from full_geometry.learning.model_errors import (
     ExitRadiance,
@@ -329,7 +330,7 @@ class _ObjectTraining:
         self.source = PairSource(obj, self.frame, self.base, self.proposals)
         self.seen: CameraExits | None = None
         self.patches = self.centres = None
-        if "faces" in mi.traverse(obj.geometry.shape):
+        if mesh.has_faces(obj.geometry.shape):
             known = start.arrays[storing.CENTRES] if start else cluster(obj, self.frame, seed=seed)
             self.centres = known.astype(np.float16)
             self.patches = Patches(obj, self.frame, self.centres.astype(np.float32))

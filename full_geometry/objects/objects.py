@@ -17,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.geometry import mesh
 from full_geometry.geometry.instances import (
     InstanceProposals,
     InstanceScene,
@@ -509,7 +510,7 @@ def _check_inclusions(name: str, inclusions: Inclusions) -> None:
         shape = inclusion.node
         if inclusion.shown:
             raise ValueError(f"what lies inside {name} must be no instance to be learnt, got {inclusion.name}")
-        if not {"faces", "to_world"} & set(mi.traverse(shape).keys()):
+        if not (mesh.has_faces(shape) or "to_world" in mi.traverse(shape)):
             raise ValueError(
                 f"what lies inside {name} must be a mesh or have a transformation to be learnt, got the "
                 f"{shape.class_name()} {name_of(shape)}"

@@ -21,6 +21,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.geometry import mesh
 from full_geometry.geometry.points import SurfacePoint, opaque
 from full_geometry.geometry.shape import Geometry, name_of
 from halfspace_sss.physics.medium import Medium
@@ -285,9 +286,9 @@ def _interaction(
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
     si.p, si.n, si.prim_index, si.shape = mi.Point3f(p), mi.Normal3f(n), mi.UInt32(face), mi.ShapePtr(obj.shape)
     if obj.shape.has_vertex_texcoords():
-        index = obj.shape.face_indices(si.prim_index, active)
-        a, b, c = (obj.shape.vertex_position(i, active) for i in (index.x, index.y, index.z))
-        u, v, w = (obj.shape.vertex_texcoord(i, active) for i in (index.x, index.y, index.z))
+        vertices = mesh.vertices_of(obj.shape, si.prim_index, active)
+        a, b, c = mesh.positions_at(obj.shape, vertices, active)
+        u, v, w = mesh.texcoords_at(obj.shape, vertices, active)
         e, f, d = b - a, c - a, si.p - a
         ee, ef, ff = dr.dot(e, e), dr.dot(e, f), dr.dot(f, f)
         det = dr.maximum(ee * ff - ef * ef, 1e-30)

@@ -25,6 +25,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from full_geometry.geometry import mesh
 from full_geometry.geometry.points import (
     SurfacePoint,
     channel_mean,
@@ -281,9 +282,8 @@ def _fields(inside: np.ndarray, path: float) -> np.ndarray:
 
 def _bounds(obj: TranslucentObject, frame: Any) -> tuple[np.ndarray, np.ndarray]:
     """Of the object in its frame."""
-    parameters = mi.traverse(obj.geometry.shape)
-    if "vertex_positions" in parameters:
-        corners = mi.Point3f(np.array(parameters["vertex_positions"]).reshape(-1, 3).T)
+    if mesh.has_faces(obj.geometry.shape):
+        corners = mi.Point3f(mesh.vertex_positions(obj.geometry.shape).T)
     else:
         box = obj.geometry.shape.bbox()
         low, high = (np.array(v, dtype=np.float32).ravel() for v in (box.min, box.max))

@@ -21,6 +21,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.geometry import mesh
 from full_geometry.geometry.points import (
     CosineProposals,
     EntrySample,
@@ -51,11 +52,9 @@ def mesh_faces(obj: TranslucentObject) -> tuple[np.ndarray, np.ndarray, np.ndarr
     Raises:
         ValueError: the shape is no mesh.
     """
-    parameters = mi.traverse(obj.geometry.shape)
-    if "faces" not in parameters:
+    if not mesh.has_faces(obj.geometry.shape):
         raise ValueError(f"shape must be a mesh to be cut into patches, got {obj.geometry.shape.class_name()}")
-    faces = np.array(parameters["faces"]).reshape(-1, 3)
-    a, b, c = np.array(parameters["vertex_positions"], dtype=float).reshape(-1, 3)[faces].transpose(1, 0, 2)
+    a, b, c = mesh.face_corners(obj.geometry.shape)
     cross = np.cross(b - a, c - a)
     double = np.linalg.norm(cross, axis=1)
     return (a + b + c) / 3, cross / np.maximum(double, 1e-30)[:, None], 0.5 * double

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.geometry import mesh
 from full_geometry.geometry.identity import object_digest
 from full_geometry.geometry.points import opaque
 from full_geometry.geometry.shape import name_of
@@ -149,9 +150,8 @@ def _anchored(shape: mi.Shape) -> tuple[str, np.ndarray]:
     """Topology and anchors of a shape, see `Identity`."""
     parameters = mi.traverse(shape)
     topology = ""
-    if "faces" in parameters:
-        faces = np.array(parameters["faces"], dtype=np.uint32)
-        positions = np.array(parameters["vertex_positions"], dtype=float).reshape(-1, 3)
+    if mesh.has_faces(shape):
+        faces, positions = mesh.face_vertices(shape).astype(np.uint32), mesh.vertex_positions(shape).astype(float)
         smooth = "smooth" if shape.has_vertex_normals() else "flat"
         topology = f"{hashlib.sha256(faces.tobytes()).hexdigest()[:16]} {smooth}"
         anchors = positions[np.unique(np.linspace(0, len(positions) - 1, ANCHORS).astype(int))]
@@ -194,15 +194,14 @@ def _surface(shape: mi.Shape, spec: MediumSpec | None, sigma_t: float) -> str:
         m = spec.medium
         numbers = np.concatenate([np.ravel(v) for v in (m.albedo, m.g, m.sigma_t / max(sigma_t, 1e-30), m.eta)])
         return f"{object_digest(surface_of(shape).boundary)} {[f'{v:.6g}' for v in numbers]}"
-    return f"{object_digest(bsdf)} {_painted(shape)} {shape.has_flipped_normals()}"
+    return f"{object_digest(bsdf)} {_painted(shape)} {mesh.is_flipped(shape)}"
 
 
 def _painted(shape: mi.Shape) -> str:
     """Digest of uv and attributes."""
     painted = hashlib.sha256()
-    for key, value in sorted(mi.traverse(shape).items()):
-        if key.startswith(("vertex_", "face_")) and key not in ("vertex_positions", "vertex_normals", "vertex_count"):
-            painted.update(key.encode() + np.array(value).tobytes())
+    for key, value in mesh.attributes(shape):
+        painted.update(key.encode() + value.tobytes())
     return painted.hexdigest()
 
 
