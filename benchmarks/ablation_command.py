@@ -10,21 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from halfspace_sss.backend import array_types
-from halfspace_sss.cli.shared import (
-    Albedo,
-    Backend,
-    Bar,
-    Eta,
-    MeanCosine,
-    OutFolder,
-    Scheduler,
-    SigmaT,
-    Workers,
-    console,
-    executor_of,
-    stated_medium,
-    whole,
-)
+from halfspace_sss.cli.shared import Backend, Bar, MediumOptions, OutFolder, Places, console, whole
 from halfspace_sss.kept_rows import KeptRows
 from halfspace_sss.provenance import check_folder, provenance, write_together
 
@@ -39,16 +25,14 @@ if TYPE_CHECKING:
 
 
 def ablation_command(
+    stated: MediumOptions,
+    places: Places,
     material: Annotated[
-        str | None, typer.Argument(help="Name of a material; see `halfspace-sss materials`.", show_default="fig10")
+        str | None, typer.Argument(help="Name of a material; see `halfspace-sss materials list`.", show_default="fig10")
     ] = None,
     channel: Annotated[
         str | None, typer.Option(help="Its channel, by name or number.", show_default="the first")
     ] = None,
-    sigma_t: SigmaT = None,
-    albedo: Albedo = None,
-    g: MeanCosine = None,
-    eta: Eta = None,
     seconds: Annotated[
         float | None, typer.Option(help="Equal time: of each training.", show_default="20, none with --samples")
     ] = None,
@@ -59,8 +43,6 @@ def ablation_command(
     seeds: Annotated[int, typer.Option(help="Trainings of each variant.", parser=whole)] = 3,
     seed: Annotated[int, typer.Option(help="Seed of the maps, and the first of the trainings.", parser=whole)] = 0,
     backend: Backend = "llvm",
-    workers: Workers = None,
-    scheduler: Scheduler = None,
     out: OutFolder = Path("ablation"),
 ) -> None:
     """Train the paper's network, `neural_material` and what lies between them, at equal time and at equal data.
@@ -72,8 +54,7 @@ def ablation_command(
     from benchmarks import ablation as variants
     from halfspace_sss.neural.training.train_material import STANDARD
 
-    given = {"sigma_t": sigma_t, "albedo": albedo, "g": g, "eta": eta}
-    title, medium = _medium(material, channel, given)
+    title, medium = _medium(material, channel, stated)
     budgets = _budgets(seconds, samples) or variants.BUDGETS
     check_folder(out)
     runs = variants.trainings(medium, budgets, seeds, seed)
@@ -81,10 +62,10 @@ def ablation_command(
     how = {"medium": repr(medium.in_mfp()), "recipe": repr(STANDARD), "seed": seed, "backend": backend}
     kept = KeptRows(out / "ablation.part", how)
     typer.echo(variants.cost(run for name, run in runs.items() if name not in kept), err=True)
-    with executor_of(workers, scheduler) as executor, Bar("ablation") as bar:
+    with places.executor() as executor, Bar("ablation") as bar:
         table = variants.ablation(
             medium, STANDARD, budgets, seeds, seed, backend=backend, kept=kept, executor=executor,
-            progress=lambda what, done, total: bar.show(done, total, what),
+            progress=bar.told,
         )  # fmt: skip
     summary, caption = variants.summary(table), variants.caption(budgets, int(table["threads"].max()))
     how = {"medium": title, "budgets": [str(b) for b in budgets], "seeds": seeds, "seed": seed, "backend": backend}
@@ -99,11 +80,11 @@ def ablation_command(
         screen.print(f"  {file}", highlight=False, markup=False, soft_wrap=True)
 
 
-def _medium(name: str | None, channel: str | None, given: dict[str, float | None]) -> tuple[str, Medium]:
+def _medium(name: str | None, channel: str | None, options: MediumOptions) -> tuple[str, Medium]:
     """A title and a scalar medium."""
     from halfspace_sss.materials.registry import one_channel
 
-    stated = stated_medium([name] if name else [], given)
+    stated = options.stated([name] if name else [])
     if stated is None:
         return one_channel(name or "fig10", channel)
     return "medium", one_channel(stated, channel)[1]

@@ -9,7 +9,7 @@ import numpy as np
 
 from figures.computing.contenders import VOLUMES, WALK, volume
 from figures.drawing.labels import in_markdown, label
-from figures.drawing.style import look
+from halfspace_sss.comparison.style import look
 
 if TYPE_CHECKING:
     import pandas

@@ -16,13 +16,13 @@ import mitsuba as mi
 import numpy as np
 
 from figures.beyond.textures import bands, mosaic
-from figures.computing.images import mean_flip
 from figures.computing.scenes import BUNNY, MM_PER_UNIT
 from figures.rivals import deng
 from full_geometry import inverse
 from full_geometry.geometry.mesh import vertex_positions
 from full_geometry.inverse.views import GivenView
 from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
+from full_geometry.trade.image_differences import mean_flip
 from halfspace_sss.progress import NamedProgress
 
 THINGS = ("bunny", "ball")

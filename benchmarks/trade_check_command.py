@@ -10,7 +10,7 @@ import typer
 
 from full_geometry.cli.variants import Variant, use_mitsuba
 from halfspace_sss.checks import check_count, check_interval
-from halfspace_sss.cli.shared import Bar, Scheduler, Workers, console, executor_of, whole
+from halfspace_sss.cli.shared import Bar, Places, console, whole
 from halfspace_sss.provenance import check_folder
 
 if TYPE_CHECKING:
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 
 def check_command(
+    places: Places,
     scenes: Annotated[int, typer.Option(help="How many.", parser=whole)] = 60,
     first: Annotated[int, typer.Option(help="Number of the first one.", parser=whole)] = 0,
     seed: Annotated[int, typer.Option(help="Other seeds draw other scenes.", parser=whole)] = 0,
@@ -26,8 +27,6 @@ def check_command(
     truth: Annotated[float, typer.Option(help="Most seconds of the long runs, with seeds of their own.")] = 24.0,
     write_only: Annotated[bool, typer.Option("--write-only", help="Write the scenes, measure nothing.")] = False,
     variant: Variant = "llvm_ad_rgb",
-    workers: Workers = None,
-    scheduler: Scheduler = None,
     out: Annotated[Path, typer.Option(help="Folder; scenes that were measured there are not measured again.")] = Path(
         "trade-check"
     ),
@@ -55,7 +54,7 @@ def check_command(
 
     parts = {f"scene {k}": (random_scene(k, seed, tolerance), out.absolute(), assess, truth, variant) for k in numbers}
     done: dict[str, dict[str, Any]] = {}
-    with executor_of(workers, scheduler) as executor, Bar("scenes") as bar:
+    with places.executor() as executor, Bar("scenes") as bar:
         for name, record in completed(executor, _record, parts):
             done[name] = record
             bar.show(len(done), scenes, name)

@@ -16,7 +16,6 @@ from figures.computing.contenders import OF_OBJECTS
 from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training_of, weight_files, with_weights
 from figures.computing.scenes import BUNNY, MM_PER_UNIT, bunny_scene, prepare
 from figures.drawing.page import page
-from figures.drawing.style import paper, saved
 from figures.drawing.trade_plot import image_shots
 from figures.modelling.closed_shapes import write_shape
 from figures.parts.part import Part, Result, Task
@@ -24,6 +23,7 @@ from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.trade.results import Assessment
 from full_geometry.trade.ways import GATHERED, LAMBERT, Way
 from halfspace_sss import materials
+from halfspace_sss.comparison.style import paper, saved
 from halfspace_sss.physics.medium import Medium
 
 TITLE = "bias against time to a given noise, for every way of rendering"

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from figures.drawing.style import TEXT
 from figures.drawing.trade_plot import LEAST, NOISE, pareto, span_in_mfp, time_to_noise
 from full_geometry.trade.advice import Job, advise
 from full_geometry.trade.results import Assessment, ObjectTrade, WayTrade
+from halfspace_sss.comparison.style import TEXT
 from halfspace_sss.noise_free import short
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ import numpy as np
 
 from figures.computing.learnt import SHAPES, object_parts
 from figures.computing.scenes import BUNNY, bunny_scene, prepare
-from figures.drawing.style import TEXT, paper, saved
 from figures.parts.part import Part, Result, Task
+from halfspace_sss.comparison.style import TEXT, paper, saved
 from halfspace_sss.provenance import check_folder
 
 TITLE = "points of entry drawn by the paper's flow, without and with light, and by patches"

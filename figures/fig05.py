@@ -10,15 +10,16 @@ from typing import Any
 import numpy as np
 
 from figures.computing.contenders import long_walk
-from figures.computing.images import FLIP, RELATIVE_MSE, compared, srgb
+from figures.computing.images import FLIP, RELATIVE_MSE, compared
 from figures.computing.scenes import BUNNY, bunny_scene, prepare
-from figures.drawing.style import TEXT, Look, paper, saved
 from figures.parts.part import Part, Result, Task
 from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.scenes import online, reference
 from full_geometry.scenes.combined import combined
 from full_geometry.scenes.reference_store import Reference
+from full_geometry.trade.image_differences import srgb
 from full_geometry.transport.storing import KIND
+from halfspace_sss.comparison.style import TEXT, Look, paper, saved
 from halfspace_sss.neural.store import weights_in
 from halfspace_sss.provenance import check_folder
 

@@ -13,8 +13,8 @@ from figures.computing.references import NOTE, against, reference_image, referen
 from figures.computing.scenes import BUNNY, ENVIRONMENTS, bunny_scene, environment, environment_file, prepare
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
-from figures.drawing.style import paper, saved
 from figures.parts.part import Part, Result, Task
+from halfspace_sss.comparison.style import paper, saved
 
 TITLE = "one full-geometry model under four environments and from four views"
 MATERIAL = "potato"

@@ -9,8 +9,8 @@ import numpy as np
 
 from figures.computing.learnt import shape_of
 from figures.computing.scenes import BUNNY, prepare
-from figures.drawing.style import COLUMN, paper, saved
 from figures.parts.part import Part, Result, Task
+from halfspace_sss.comparison.style import COLUMN, paper, saved
 
 TITLE = "error against the number of incident samples, the paper's network and ours"
 SECONDS = {"draft": 6, "paper": 600}  # CPU time of each training

@@ -52,7 +52,7 @@ def model_curves(task: Task) -> dict[str, Any]:
 
 def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
     """The figure as PDF and PNG, the values and the errors as tables."""
-    from figures.drawing.curve_plot import render
+    from halfspace_sss.comparison.curve_plot import render
 
     result = curve_set(results)
     files: dict[str, bytes | str] = {f"fig10.{ending}": data for ending, data in render(result).items()}

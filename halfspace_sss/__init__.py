@@ -19,13 +19,6 @@ Conventions, kept by every part of the library:
 
 from __future__ import annotations
 
-import sys
-
-if getattr(sys, "argv", [""])[0].endswith(("halfspace-sss", "halfspace-sss.exe", "halfspace-sss-script.py")):
-    from halfspace_sss.interrupts import end_in_a_line  # the command line, before anything takes its time
-
-    end_in_a_line()
-
 from typing import TYPE_CHECKING
 
 from halfspace_sss.backend import prefer_bundled_llvm

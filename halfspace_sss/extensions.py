@@ -5,7 +5,6 @@
 - `halfspace_sss.commands`: name -> function with typer annotations, a further command of `halfspace-sss`.
 - `halfspace_sss.transports`, `halfspace_sss.choosers`, `halfspace_sss.learners`: name of a model -> what makes it of an
   object, what stands for another by name, what learns it; see `registry`.
-- `halfspace_sss.figures`: kind of result -> function that takes the result and returns {file ending: bytes}.
 
 What a package offers may fail in any way: it is left out with a warning in one line that names it, and nothing else is.
 """
@@ -17,11 +16,10 @@ from collections.abc import Callable, Iterator
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-COMMANDS, FIGURES, MODELS = "halfspace_sss.commands", "halfspace_sss.figures", "halfspace_sss.models"
+COMMANDS, MODELS = "halfspace_sss.commands", "halfspace_sss.models"
 CHOOSERS, LEARNERS, TRANSPORTS = "halfspace_sss.choosers", "halfspace_sss.learners", "halfspace_sss.transports"
 FAILURES = (Exception, SystemExit)  # what code of somebody else may end with
 OWN = "halfspace-sss"  # the distribution whose entry points come first
-Renderer = Callable[[Any], dict[str, bytes]]
 
 
 def warn_left_out(group: str, name: str, error: object) -> None:
@@ -66,19 +64,3 @@ def commands() -> Iterator[tuple[str, Callable]]:
             yield name, each
         else:
             warn_left_out(COMMANDS, name, f"it must be a function, got {each!r}")
-
-
-def renderer(kind: str) -> Renderer | None:
-    """The function that draws results of a kind, e.g. "curves"; None if it or the drawing library is not installed."""
-    for entry in entry_points(group=FIGURES, name=kind):
-        try:
-            result = entry.load()
-        except FAILURES as error:
-            missing = (getattr(error, "name", None) or "").split(".")[0]
-            if not isinstance(error, ModuleNotFoundError) or missing not in ("PIL", "matplotlib", "figures"):
-                warn_left_out(FIGURES, kind, error)
-            continue
-        if callable(result):
-            return result
-        warn_left_out(FIGURES, kind, f"it must be a function, got {result!r}")
-    return None

@@ -1,13 +1,20 @@
-"""All commands of the command line by their words, those of `train` too."""
+"""All commands of the command line by their words, those of groups too."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
+from typing import Any
 
-from figures import command_line as cli
+import typer
 
-COMMANDS: dict[str, Callable] = {info.name: info.callback for info in cli.app.registered_commands} | {
-    f"{group.name} {info.name}": info.callback
-    for group in cli.app.registered_groups
-    for info in group.typer_instance.registered_commands
-}
+from figures.app import app
+
+
+def _members(command: Any, words: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
+    for name, member in getattr(command, "commands", {}).items():
+        yield from _members(member, (*words, name))
+    if not hasattr(command, "commands"):
+        yield " ".join(words), command
+
+
+COMMANDS: dict[str, Any] = dict(_members(typer.main.get_command(app)))

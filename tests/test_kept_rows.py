@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from figures import command_line as cli
+from figures import app as cli
 from halfspace_sss.comparison import model_truths
 from halfspace_sss.kept_rows import KeptRows
 
@@ -30,7 +30,7 @@ def test_rows_of_the_same_run_are_found_again_and_others_dropped(tmp_path: Path)
 
 
 def _truths(out: Path) -> Any:
-    return CliRunner().invoke(cli.app, ["errors", "--truths", "--model", "better_dipole", "--out", str(out)])
+    return CliRunner().invoke(cli.app, ["errors", "truths", "--model", "better_dipole", "--out", str(out)])
 
 
 @pytest.mark.slow

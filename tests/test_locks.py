@@ -15,7 +15,7 @@ import pytest
 from render_files import XML
 from typer.testing import CliRunner
 
-from figures import command_line as cli
+from figures import app as cli
 from halfspace_sss import Medium
 from halfspace_sss.locks import one_writer
 from halfspace_sss.maps.grid import MapGrid

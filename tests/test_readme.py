@@ -13,7 +13,7 @@ import pytest
 import typer
 
 from benchmarks.__main__ import app as studies
-from figures import command_line as cli
+from figures import app as cli
 
 ROOT = Path(__file__).resolve().parent.parent
 LINES, WORDS = 170, 25  # most of README.md, and of a sentence on average

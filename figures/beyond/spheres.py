@@ -13,8 +13,8 @@ import numpy as np
 from figures.computing import contenders
 from figures.computing.learnt import weight_files
 from figures.computing.scenes import prepare
-from figures.drawing.style import COLUMN, look, paper, saved
 from figures.parts.part import Part, Result, Task
+from halfspace_sss.comparison.style import COLUMN, look, paper, saved
 from halfspace_sss.physics.medium import Medium
 
 TITLE = "bias of the half-space on spheres of decreasing radius, and what `neural_shape` leaves of it"

@@ -12,8 +12,8 @@ from figures.computing.references import against, reference_shot
 from figures.drawing.image_grid import image_grid
 from figures.drawing.labels import label
 from figures.drawing.page import page
-from figures.drawing.style import paper, saved
 from figures.parts.part import Result
+from halfspace_sss.comparison.style import paper, saved
 
 
 def image_files(

@@ -16,8 +16,9 @@ from matplotlib.font_manager import FontProperties
 from matplotlib.patches import Rectangle
 from matplotlib.textpath import TextPath
 
-from figures.computing.images import FLIP, Shot, absent, srgb
-from figures.drawing.style import TEXT
+from figures.computing.images import FLIP, Shot, absent
+from full_geometry.trade.image_differences import srgb
+from halfspace_sss.comparison.style import TEXT
 
 GAP, ROW_GAP, TITLE, CAPTION, NAME = 0.035, 0.07, 0.17, 0.13, 0.16  # inches
 CROP_COLORS = ("#E69F00", "#56B4E9", "#009E73")
@@ -42,7 +43,7 @@ def image_grid(
     scenes: Mapping[str, Sequence[Shot]], *, crops: Mapping[str, Sequence[Crop]] | None = None,
     exposures: Mapping[str, float] | None = None, printed: Sequence[str] = (FLIP,), width: float = TEXT,
 ) -> Figure:  # fmt: skip
-    """The figure; draw it under `figures.drawing.style.paper` and write it with `figures.drawing.style.saved`.
+    """The figure; draw it under `paper` of `halfspace_sss.comparison.style`, write it with `saved`.
 
     FLIP maps and numbers are drawn as they are: `compared` must have had the exposure of the scene. A model that has no
     image in a scene (`figures.computing.images.absent`, or none at all) gets a pale frame that says so.

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from figures.computing.contenders import VOLUMES, WALK
-from figures.drawing.style import look
+from halfspace_sss.comparison.style import look
 
 if TYPE_CHECKING:
     import pandas

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib import colormaps  # without it there is no page, which must be known before one is drawn
 
-from figures.computing.images import FLIP, RELATIVE_MSE, Shot, compared, denoised, guides, srgb
+from figures.computing.images import FLIP, RELATIVE_MSE, Shot, compared, denoised, guides
+from full_geometry.trade.image_differences import srgb
 
 if TYPE_CHECKING:
     from full_geometry.inverse.comparing import MaterialFit

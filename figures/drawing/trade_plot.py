@@ -11,10 +11,10 @@ from matplotlib.figure import Figure
 
 from figures.computing.images import Shot, compared
 from figures.drawing.page import page
-from figures.drawing.style import TEXT, TRACED, Look, look, paper, saved
 from full_geometry.trade.images import TradePicture
 from full_geometry.trade.results import Assessment, ObjectTrade, WayTrade
 from full_geometry.trade.ways import GATHERED, NO_SINGLE
+from halfspace_sss.comparison.style import TEXT, TRACED, Look, look, paper, saved
 
 NOISE = 0.01  # of the mean radiance, to which times are
 LEAST = 0.003  # smallest bias that is drawn; what is below lies there, an arrow down

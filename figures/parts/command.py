@@ -1,122 +1,142 @@
-"""The command `halfspace-sss figures`: compute what changed of the paper's figures, and draw them."""
+"""The commands `halfspace-sss figures ...`: compute what changed of the paper's figures, and draw them."""
 
 from __future__ import annotations
 
 import time
-from enum import Enum
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 import figures
-from full_geometry.cli.variants import Variant, use_mitsuba
+from full_geometry.cli.variants import use_mitsuba
 from halfspace_sss.backend import BackendError, cores
-from halfspace_sss.cli.shared import Bar, Scheduler, console, executor_of, whole
+from halfspace_sss.cli.shared import Bar, Places, say, say_files, table
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from concurrent.futures import Executor
-
     from figures.parts.runner import Plan
 
 DRAWING = ("PIL", "flip_evaluator", "matplotlib")
-EXTRAS = ("PIL", "flip_evaluator", "matplotlib", "mitsuba")
-WORKERS = "Processes that share the cores and the parts of the work."
 MOST_WORKERS = 2  # that are not asked for: each has its kernels in memory
 AHEAD = 2  # parts that each process has been given, so that none waits while a figure is drawn
 
 
-class Action(str, Enum):
-    """What is done with the figures."""
+@dataclass(frozen=True)
+class FigureOptions:
+    """Figures, and how much is spent on them."""
 
-    list = "list"
-    compute = "compute"
-    draw = "draw"
-    all = "all"
-
-
-class Quality(str, Enum):
-    """How much is spent on them."""
-
-    draft = "draft"
-    paper = "paper"
-
-
-def figures_command(
-    action: Annotated[
-        Action, typer.Argument(help="list what there is, compute parts, draw, or all: compute and draw.")
-    ],
     names: Annotated[
-        list[str] | None, typer.Argument(help="Names of figures.", metavar="[NAMES]...", show_default="all")
-    ] = None,
-    quality: Annotated[Quality, typer.Option(help="draft: minutes on two cores. paper: as published.")] = Quality.draft,
-    workers: Annotated[int | None, typer.Option(help=WORKERS, parser=whole, show_default="2 for drafts")] = None,
-    scheduler: Scheduler = None,
-    variant: Variant = "llvm_ad_rgb",
-    out: Annotated[Path, typer.Option(help="Folder for parts and pictures of all figures.")] = Path("out"),
-) -> None:
-    """Make the figures of the paper; a part that is there is computed again only if what it depends on changed."""
-    from figures.parts.runner import figure, plan
+        list[str] | None,
+        typer.Argument(help="Names of figures.", show_default="all", autocompletion=figures.figure_modules),
+    ] = None
+    quality: Annotated[
+        Literal["draft", "paper"], typer.Option(help="draft: minutes on two cores. paper: as published.")
+    ] = "draft"
+    out: Annotated[Path, typer.Option(help="Folder for parts and pictures of all figures.")] = Path("out")
 
-    if variant != "llvm_ad_rgb":
-        if workers or scheduler:
-            raise ValueError(f"variant must be llvm_ad_rgb with --workers or --scheduler, got {variant!r}")
-        use_mitsuba(variant, ("llvm_ad_rgb", "cuda_ad_rgb"))
-    chosen = list(dict.fromkeys(names or figures.figure_modules()))
-    do = {Action.list: _list, Action.compute: _compute, Action.draw: _draw, Action.all: _all}[action]
-    try:
+    def plans(self) -> list[Plan]:
+        """What is there and what is missing of each."""
+        from figures.parts.runner import figure, plan
+
+        chosen = list(dict.fromkeys(self.names or figures.figure_modules()))
         for name in chosen:
             figure(name)
-        if action in (Action.draw, Action.all):
-            _check_drawing()
-        plans = [plan(name, quality.value, out) for name in chosen]
-        if workers is None and scheduler is None and variant == "llvm_ad_rgb" and quality is Quality.draft:
-            workers = _workers(plans) if action in (Action.compute, Action.all) else None
-        with executor_of(workers, scheduler) as executor:
-            do(plans, out, executor, workers and AHEAD * workers)
+        return [plan(name, self.quality, self.out) for name in chosen]
+
+
+@contextmanager
+def _libraries(drawing: bool = False) -> Iterator[None]:
+    """Say of a missing library how it is installed; of one that figures are drawn with before anything is computed."""
+    try:
+        for name in DRAWING if drawing else ():
+            if find_spec(name) is None:
+                raise ModuleNotFoundError(name=name)
+        yield
     except ModuleNotFoundError as error:
-        if (error.name or "").split(".")[0] not in EXTRAS:
+        if (error.name or "").split(".")[0] not in (*DRAWING, "mitsuba"):
             raise
         raise BackendError(f'figures need {error.name}: pip install "halfspace-sss[figures,render]"') from error
 
 
-def _workers(plans: list[Plan]) -> int | None:
+def list_figures(chosen: FigureOptions) -> None:
+    """List figures: how many of their parts are computed, and how long the others will take."""
+    from figures.parts.runner import figure
+
+    with _libraries():
+        plans = chosen.plans()
+    rows = []
+    for p in plans:
+        counts = (len(p.parts), len(p.parts) - len(p.missing), len(p.damaged))
+        drawn = "yes" if (p.folder / f"{p.name}.json").exists() else "no"
+        rows.append((p.name, figure(p.name).TITLE, *map(str, counts), _time(p), drawn))
+    headings = ("figure", "shows", "parts", "computed", "damaged", "time for the rest", "drawn")
+    say(table(headings, rows, title=f"quality {chosen.quality}, in {chosen.out}", left=2))
+    say(*(f"damaged: {reason}" for p in plans for reason in p.damaged.values()))
+
+
+Variant = Annotated[Literal["llvm_ad_rgb", "cuda_ad_rgb"], typer.Option(help="Variant of Mitsuba.")]
+
+
+def compute(chosen: FigureOptions, places: Places, variant: Variant = "llvm_ad_rgb") -> None:
+    """Compute parts of figures; one that is there is computed again only if what it depends on changed."""
+    with _libraries():
+        for _ in _completed(chosen, places, variant):
+            pass
+
+
+def draw(chosen: FigureOptions) -> None:
+    """Draw figures from their parts."""
+    with _libraries(drawing=True):
+        for p in chosen.plans():
+            _draw(p, chosen.out)
+
+
+def make_all(chosen: FigureOptions, places: Places, variant: Variant = "llvm_ad_rgb") -> None:
+    """Compute figures, and draw each as soon as its parts are there."""
+    with _libraries(drawing=True):
+        for p in _completed(chosen, places, variant):
+            _draw(p, chosen.out)
+
+
+COMMANDS = {"list": list_figures, "compute": compute, "draw": draw, "all": make_all}
+
+
+def _draw(p: Plan, out: Path) -> None:
+    from figures.parts.runner import draw
+
+    say_files(draw(p.name, p.quality, out))
+
+
+def _completed(chosen: FigureOptions, places: Places, variant: str) -> Iterator[Plan]:
+    """The figures as all of their parts are computed."""
+    from figures.parts.runner import completed_plans, duration
+
+    if variant != "llvm_ad_rgb":
+        if places != Places():
+            raise ValueError(f"variant must be llvm_ad_rgb with --workers or --scheduler, got {variant!r}")
+        use_mitsuba(variant)
+    plans = chosen.plans()
+    if places == Places() and variant == "llvm_ad_rgb" and chosen.quality == "draft":
+        places = Places(workers=_workers(plans))
+    _announce(plans)
+    started = time.perf_counter()
+    with places.executor() as executor, Bar(plans[0].name if len(plans) == 1 else "figures") as bar:
+        most = places.workers and AHEAD * places.workers
+        for p in completed_plans(plans, bar.show, say, executor, most):
+            with bar.standing():
+                yield p
+    if any(p.missing for p in plans):
+        say(f"computed in {duration(time.perf_counter() - started)}")
+
+
+def _workers(plans: Sequence[Plan]) -> int | None:
     """Processes for drafts, whose parts are too small for several threads; None for this one."""
     number = min(cores(), MOST_WORKERS, len({p.keys[name] for p in plans for name in p.missing}))
     return number if number > 1 else None
-
-
-def _check_drawing() -> None:
-    """Before anything is computed: BackendError unless the libraries that figures are drawn with are there."""
-    for name in DRAWING:
-        if find_spec(name) is None:
-            raise BackendError(f'figures need {name}: pip install "halfspace-sss[figures,render]"')
-
-
-def _say(text: str) -> None:
-    console().print(text, highlight=False, markup=False, soft_wrap=True)
-
-
-def _list(plans: list[Plan], out: Path, executor: Executor | None, most: int | None) -> None:
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
-    from figures.parts.runner import figure
-
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, title=f"quality {plans[0].quality}, in {out}", title_justify="left")
-    for heading in ("figure", "shows", "parts", "computed", "damaged", "time for the rest", "drawn"):
-        table.add_column(heading, justify="left" if heading in ("figure", "shows") else "right", overflow="fold")
-    for p in plans:
-        done = len(p.parts) - len(p.missing)
-        drawn = "yes" if (p.folder / f"{p.name}.json").exists() else "no"
-        counts = (str(len(p.parts)), str(done), str(len(p.damaged)))
-        table.add_row(p.name, figure(p.name).TITLE, *counts, _time(p), drawn)
-    console().print(table)
-    for p in plans:
-        for reason in p.damaged.values():
-            _say(f"damaged: {reason}")
 
 
 def _time(p: Plan) -> str:
@@ -131,58 +151,19 @@ def _time(p: Plan) -> str:
     return f"about {duration(p.projected_seconds)}" + (f" and {unknown}" if unknown else "")
 
 
-def _announce(p: Plan) -> None:
+def _announce(plans: Sequence[Plan]) -> None:
     """The time, before it is spent."""
-    if not p.missing:
-        _say(f"{p.name} {p.quality}: all {len(p.parts)} parts are there")
-        return
-    _say(f"{p.name} {p.quality}: {len(p.missing)} of {len(p.parts)} parts to compute, {_time(p)}")
-    if p.unmeasured and p.quality == "paper":
-        _say(f"  `halfspace-sss figures compute {p.name} --quality draft` measures them first")
-    sources = [each.source for each in p.seconds.values() if each.source]
-    for source in dict.fromkeys(sources):
-        _say(f"  {sources.count(source)} measured by {source}, scaled by work")
-
-
-def _compute(plans: list[Plan], out: Path, executor: Executor | None, most: int | None) -> None:
-    for _ in _completed(plans, executor, most):
-        pass
-
-
-def _completed(plans: list[Plan], executor: Executor | None, most: int | None) -> Iterator[Plan]:
-    """The figures as all of their parts are computed."""
-    from figures.parts.runner import completed_plans, duration
-
-    _announce_all(plans)
-    started = time.perf_counter()
-    with Bar(plans[0].name if len(plans) == 1 else "figures") as bar:
-        for p in completed_plans(plans, bar.show, _say, executor, most):
-            with bar.standing():
-                yield p
-    if any(p.missing for p in plans):
-        _say(f"computed in {duration(time.perf_counter() - started)}")
-
-
-def _announce_all(plans: list[Plan]) -> None:
     from figures.parts.runner import duration
 
     for p in plans:
-        _announce(p)
+        if not p.missing:
+            say(f"{p.name} {p.quality}: all {len(p.parts)} parts are there")
+            continue
+        say(f"{p.name} {p.quality}: {len(p.missing)} of {len(p.parts)} parts to compute, {_time(p)}")
+        if p.unmeasured and p.quality == "paper":
+            say(f"  `halfspace-sss figures compute {p.name} --quality draft` measures them first")
     if sum(bool(p.missing) for p in plans) > 1:
         unknown = sum(len(p.unmeasured) for p in plans)
         more = f" and {unknown} parts not measured yet" if unknown else ""
         each = {p.keys[name]: s.seconds or 0.0 for p in plans for name, s in p.seconds.items()}  # shared ones once
-        _say(f"together about {duration(sum(each.values()))}{more}")
-
-
-def _draw(plans: list[Plan], out: Path, executor: Executor | None, most: int | None) -> None:
-    from figures.parts.runner import draw
-
-    for p in plans:
-        for path in draw(p.name, p.quality, out):
-            _say(f"  {path}")
-
-
-def _all(plans: list[Plan], out: Path, executor: Executor | None, most: int | None) -> None:
-    for p in _completed(plans, executor, most):
-        _draw([p], out, executor, most)
+        say(f"together about {duration(sum(each.values()))}{more}")

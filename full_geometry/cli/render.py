@@ -3,29 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from full_geometry.cli.variants import VARIANTS, Variant, use_mitsuba
-from halfspace_sss.backend import BackendError
-from halfspace_sss.cli.shared import (
-    SPECTRAL,
-    Bar,
-    Define,
-    OutFolder,
-    SampleSeed,
-    console,
-    defined,
-    numbers,
-    tell,
-    whole,
-)
-from halfspace_sss.extensions import renderer
-from halfspace_sss.locks import one_writer
-from halfspace_sss.provenance import check_folder, replace_together, write_atomically
+from full_geometry.cli.variants import Drawers, use_mitsuba
+from halfspace_sss.cli import shared
 
 if TYPE_CHECKING:
     import numpy as np
@@ -33,37 +19,47 @@ if TYPE_CHECKING:
     from full_geometry.scenes.picture import Picture
     from full_geometry.scenes.reference import Limits
     from full_geometry.scenes.reference_store import Reference
-    from halfspace_sss.extensions import Renderer
 
 SPP = 64
 ENDINGS = ("png", "html", "denoised.exr", "denoised.png")  # of what is drawn
 PHASES = ("walks.exr", "walks.json", "model.exr", "model.json")  # of an image with walks in it
+RenderVariant = Annotated[
+    Literal["llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral", "cuda_ad_rgb", "cuda_ad_mono", "cuda_ad_spectral"],
+    typer.Option(help="Variant of Mitsuba."),
+]
 
 
-def render_command(
-    scene: Annotated[Path, typer.Argument(help="Mitsuba XML file whose objects use the BSDF `translucent`.")],
+@dataclass(frozen=True)
+class UntilOptions:
+    """What ends a render: whichever comes first."""
+
+    spp: Annotated[
+        int | None,
+        typer.Option(help="Samples for each pixel.", parser=shared.whole, show_default="64, or what else ends it"),
+    ] = None
+    target_error: Annotated[float | None, typer.Option(help="Stop at this relative error of the image.")] = None
+    seconds: Annotated[float | None, typer.Option(help="Stop after this time of rendering.")] = None
+
+    def limits(self) -> Limits:
+        """As `scenes.reference` takes it."""
+        from full_geometry.scenes.reference import Limits
+
+        spp = SPP if (self.spp, self.target_error, self.seconds) == (None,) * 3 else self.spp
+        return Limits(spp, None, self.target_error, self.seconds)
+
+
+@dataclass(frozen=True)
+class TransportOptions:
+    """The model of the objects, in place of what the scene says."""
+
     model: Annotated[
         str | None,
         typer.Option(help="A model for all objects, auto, or path_traced.", show_default="as the scene says"),
-    ] = None,
+    ] = None
     orders: Annotated[
-        str | None, typer.Option(help="total, multiple or single.", show_default="as the scene says")
-    ] = None,
-    spp: Annotated[
-        int | None, typer.Option(help="Samples for each pixel.", parser=whole, show_default="64, or what else ends it")
-    ] = None,
-    target_error: Annotated[float | None, typer.Option(help="Stop at this relative error of the image.")] = None,
-    seconds: Annotated[float | None, typer.Option(help="Stop after this time of rendering.")] = None,
-    seed: SampleSeed = 0,
-    sensor: Annotated[str, typer.Option(help="Number of the sensor, several as 0,1, or all.")] = "0",
-    define: Define = None,
-    train_seconds: Annotated[
-        float | None,
-        typer.Option(help="Time to learn an object without weights; 0 refuses it.", show_default="60, or the scene's"),
-    ] = None,
-    train_error: Annotated[
-        float | None, typer.Option(help="Error at which it has learnt enough.", show_default="0.03, or the scene's")
-    ] = None,
+        Literal["total", "multiple", "single"] | None,
+        typer.Option(help="Orders of scattering.", show_default="as the scene says"),
+    ] = None
     light: Annotated[
         str | None,
         typer.Option(
@@ -71,50 +67,71 @@ def render_command(
             "path_traced precomputed (bias below .3 %), sampled, or auto.",
             show_default="of models sampled, of path_traced auto, or the scene's",
         ),
-    ] = None,
+    ] = None
+    train_seconds: Annotated[
+        float | None,
+        typer.Option(help="Time to learn an object without weights; 0 refuses it.", show_default="60, or the scene's"),
+    ] = None
+    train_error: Annotated[
+        float | None, typer.Option(help="Error at which it has learnt enough.", show_default="0.03, or the scene's")
+    ] = None
+
+    def settings(self, denoise: bool) -> dict[str, Any]:
+        """Of the integrator, those that are given."""
+        given = {"train_seconds": self.train_seconds, "train_error": self.train_error, "light": self.light}
+        return {name: value for name, value in {**given, "layers": denoise or None}.items() if value is not None}
+
+
+def render(
+    context: typer.Context,
+    scene: Annotated[Path, typer.Argument(help="Mitsuba XML file whose objects use the BSDF `translucent`.")],
+    transport: TransportOptions,
+    until: UntilOptions,
+    seed: shared.Seed = 0,
+    sensor: Annotated[str, typer.Option(help="Number of the sensor, several as 0,1, or all.")] = "0",
+    define: shared.Define = None,
     denoise: Annotated[bool, typer.Option("--denoise", help="An image without noise beside the other.")] = False,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with the unfinished or finished render of the same settings.")
     ] = False,
-    variant: Variant = "llvm_ad_rgb",
-    out: OutFolder = Path("render"),
+    variant: RenderVariant = "llvm_ad_rgb",
+    out: shared.OutFolder = Path("render"),
 ) -> None:
     """Render a scene: NAME_MODEL.exr with variance, .png, and .html; error, samples and time are printed.
 
     Until it is done, NAME_MODEL.unfinished.exr holds it, and the files of before stay. Objects whose model has to learn
     them are learnt first, where they have no weights, from walks that join the image.
     """
-    use_mitsuba(variant, VARIANTS + SPECTRAL)
+    use_mitsuba(variant)
     from full_geometry.integrators.bssrdf import is_bssrdf
     from full_geometry.scenes.picture import Picture
-    from full_geometry.scenes.reference import Limits, chosen
+    from full_geometry.scenes.reference import chosen
     from full_geometry.scenes.scene_files import open_scene
-    from halfspace_sss.checks import check_count
+    from halfspace_sss.locks import one_writer
+    from halfspace_sss.provenance import check_folder
 
-    limits = Limits(SPP if (spp, target_error, seconds) == (None,) * 3 else spp, None, target_error, seconds)
-    check_count("seed", seed, 0)
-    parameters, draw = defined(define), _renderer(denoise)
+    limits, parameters = until.limits(), shared.defined(define)
+    drawers = _drawers(context, denoise)
     check_folder(out)
-    settings = {"train_seconds": train_seconds, "train_error": train_error, "light": light, "layers": denoise or None}
-    settings = {name: value for name, value in settings.items() if value is not None}
-    loaded = open_scene(scene, model, orders, parameters, settings)
-    chosen_sensors = _sensors(sensor, loaded)
-    for sentence in chosen(loaded, loaded.integrator()).get("choices", {}).values():
-        console().print(sentence, highlight=False, markup=False, soft_wrap=True)
-    cameras = [loaded.sensors()[k] for k in chosen_sensors] if denoise else []
-    if any(not camera.film().rfilter().is_box_filter() for camera in cameras):
-        tell("the film has no box filter: the denoiser keeps most of the noise that other filters spread over pixels")
-    for k in chosen_sensors:
-        name = [scene.stem, model or "scene", light or "", f"sensor{k}" if k else ""]
+    loaded = open_scene(scene, transport.model, transport.orders, parameters, transport.settings(denoise))
+    sensors = _sensors(sensor, loaded)
+    shared.say(*chosen(loaded, loaded.integrator()).get("choices", {}).values())
+    if denoise and any(not loaded.sensors()[k].film().rfilter().is_box_filter() for k in sensors):
+        shared.tell(
+            "the film has no box filter: the denoiser keeps most of the noise that other filters spread over pixels"
+        )
+    for k in sensors:
+        name = [scene.stem, transport.model or "scene", transport.light or "", f"sensor{k}" if k else ""]
         file = out / f"{'_'.join(filter(None, name))}.exr"
         with one_writer(file):
             result = _rendered(loaded, file, limits, {"seed": seed, "sensor": k}, resume)
             emission = result.mean[..., -3:] if getattr(loaded.integrator(), "layers", False) else None
-            numbers, error = _numbers(result), _error(result)
-            picture = Picture(file.stem, _colours(result.mean), numbers, error, loaded, k, denoise, emission)
-            _report(result, _publish(picture, file, draw))
-    for sentence in loaded.integrator().gathered if is_bssrdf(loaded.integrator()) else ():
-        console().print(sentence, highlight=False, markup=False, soft_wrap=True)
+            told, error = _numbers(result), _error(result)
+            picture = Picture(file.stem, _colours(result.mean), told, error, loaded, k, denoise, emission)
+            files = _publish(picture, file, drawers)
+            shared.say(f"{result.spp} samples a pixel in {result.seconds:.1f} s; {error}")
+            shared.say_files(files)
+    shared.say(*(loaded.integrator().gathered if is_bssrdf(loaded.integrator()) else ()))
 
 
 def _sensors(text: str, scene: Any) -> list[int]:
@@ -124,7 +141,7 @@ def _sensors(text: str, scene: Any) -> list[int]:
     if text == "all":
         result = list(range(len(scene.sensors())))
     else:
-        found = numbers("sensor", text)
+        found = shared.numbers("sensor", text)
         if not all(k.is_integer() for k in found):
             raise ValueError(f"sensor must be whole numbers, several as 0,1, or all, got {text!r}")
         result = list(dict.fromkeys(int(k) for k in found))
@@ -133,12 +150,14 @@ def _sensors(text: str, scene: Any) -> list[int]:
     return result
 
 
-def _renderer(denoise: bool) -> Renderer | None:
+def _drawers(context: typer.Context, denoise: bool) -> Drawers | None:
     """What draws the page and denoises, if it is there; BackendError before anything is rendered in vain."""
-    result = renderer("render")
-    if denoise and (result is None or find_spec("mitsuba_oidn") is None):
+    from halfspace_sss.backend import BackendError
+
+    drawers = context.find_object(Drawers)
+    if denoise and (drawers is None or find_spec("mitsuba_oidn") is None):
         raise BackendError('denoising needs mitsuba-oidn and a page: pip install "halfspace-sss[figures]"')
-    return result
+    return drawers
 
 
 def _unfinished(file: Path) -> Path:
@@ -149,6 +168,7 @@ def _rendered(scene: Any, file: Path, limits: Limits, which: dict[str, int], res
     """The render, in files of another name until it is done."""
     from full_geometry.scenes import online
     from full_geometry.scenes.scene_files import first_cause
+    from halfspace_sss.backend import BackendError
 
     part, bars = _unfinished(file), _Bars(limits)
     begun = any(path.exists() for path in (part, *online.files(part).values()))
@@ -166,7 +186,7 @@ class _Bars:
     """Progress of learning and of rendering, one after the other."""
 
     def __init__(self, limits: Limits) -> None:
-        self.limits, self.bar, self.title, self.so_far = limits, Bar(""), "", 0
+        self.limits, self.bar, self.title, self.so_far = limits, shared.Bar(""), "", 0
 
     def __enter__(self) -> _Bars:
         return self
@@ -186,11 +206,11 @@ class _Bars:
 
     def _begin(self, title: str) -> None:
         self.bar.__exit__(None, None, None)
-        self.bar, self.title = Bar(title), title
+        self.bar, self.title = shared.Bar(title), title
 
     def _told(self, sentence: str) -> None:
         self._begin("learning")
-        tell(sentence)
+        shared.tell(sentence)
 
     def _learnt(self, what: str, done: int, total: int) -> None:
         self.bar.show(done, total, what)
@@ -203,10 +223,12 @@ class _Bars:
         self.bar.show(round(1000 * self.limits.share(reference)), 1000, f"{reference.spp} spp{error}")
 
 
-def _publish(picture: Picture, file: Path, draw: Renderer | None) -> list[Path]:
+def _publish(picture: Picture, file: Path, drawers: Drawers | None) -> list[Path]:
     """Put the finished files in the place of those of before, all of one render at any moment; their paths."""
+    from halfspace_sss.provenance import replace_together, write_atomically
+
     part = _unfinished(file)
-    drawn = {"png": picture.png(), **(draw(picture) if draw else {})}
+    drawn = {"png": picture.png(), **(drawers.render(picture) if drawers else {})}
     for ending, data in drawn.items():
         write_atomically(part.with_suffix(f".{ending}"), data)
     phases = [ending for ending in PHASES if part.with_suffix(f".{ending}").exists()]
@@ -225,13 +247,6 @@ def _numbers(reference: Reference) -> dict[str, str]:
     error = reference.relative_error
     told = f"{error:.2%}" if 0 < error < math.inf else "–"
     return {"samples": str(reference.spp), "time, s": f"{reference.seconds:.3g}", "relative error": told}
-
-
-def _report(reference: Reference, files: list[Path]) -> None:
-    screen = console()
-    screen.print(f"{reference.spp} samples a pixel in {reference.seconds:.1f} s; {_error(reference)}", highlight=False)
-    for path in files:
-        screen.print(f"  {path}", highlight=False, markup=False, soft_wrap=True)
 
 
 def _error(reference: Reference) -> str:

@@ -1,23 +1,38 @@
-"""Mitsuba under the variant that a command asks for, its warnings as ours."""
+"""What commands on scenes share: Mitsuba under a variant, its warnings as ours, and what draws results."""
 
 from __future__ import annotations
 
 import signal
-from typing import Annotated, Any
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from halfspace_sss.backend import BackendError, prepare_llvm
 from halfspace_sss.cli.interrupts import interrupts
 
-VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono", "cuda_ad_rgb", "cuda_ad_mono")
-Variant = Annotated[str, typer.Option(help="Variant of Mitsuba.")]
+if TYPE_CHECKING:
+    from full_geometry.inverse.comparing import MaterialFit
+    from full_geometry.scenes.picture import Picture
+    from full_geometry.trade.images import TradePicture
+
+Variant = Annotated[
+    Literal["llvm_ad_rgb", "llvm_ad_mono", "cuda_ad_rgb", "cuda_ad_mono"], typer.Option(help="Variant of Mitsuba.")
+]
 
 
-def use_mitsuba(variant: str, known: tuple[str, ...] = VARIANTS) -> None:
-    """Mitsuba with our plugins, under a variant, one of those that a command knows."""
-    if variant not in known:
-        raise ValueError(f"variant must be one of {', '.join(known)}, got {variant!r}")
+@dataclass(frozen=True)
+class Drawers:
+    """Functions that draw results as {file ending: content}: the object of the context, from above; None: undrawn."""
+
+    render: Callable[[Picture], dict[str, bytes]]
+    fit: Callable[[MaterialFit], dict[str, bytes]]
+    trade: Callable[[TradePicture], dict[str, bytes]]
+
+
+def use_mitsuba(variant: str) -> None:
+    """Mitsuba with our plugins, under a variant."""
     if variant.startswith("llvm"):
         prepare_llvm()
     try:

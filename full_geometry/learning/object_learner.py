@@ -1,4 +1,4 @@
-"""The learner `full_geometry` of the commands `train object` and `errors --scene`; objects are those of a scene."""
+"""The learner `full_geometry` of the commands `train object` and `errors object`; objects are those of a scene."""
 
 from __future__ import annotations
 

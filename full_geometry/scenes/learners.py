@@ -1,4 +1,4 @@
-"""What learns an object of a scene and says how wrong models of it are: the commands `train object`, `errors --scene`.
+"""What learns an object of a scene and says how wrong models of it are: the commands `train object`, `errors object`.
 
 An entry point of the group `halfspace_sss.learners` has the name of the model that it learns, and is a module or an
 object with the functions of `Learner`, or with `train_shapes` of `ShapeLearner`, for `train shapes`.

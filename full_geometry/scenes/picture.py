@@ -12,7 +12,7 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """What is drawn of a render, here and by the entry point "render" of `halfspace_sss.figures`.
+    """What is drawn of a render.
 
     Args:
         title: name of the scene and the model.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,11 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.scenes.scene_files import PATH_TRACED
+from full_geometry.trade.image_differences import mean_flip
 from full_geometry.trade.results import Assessment
 from full_geometry.trade.sampling import radiance
 from full_geometry.trade.statistics import seeded
 from full_geometry.trade.ways import Stage, Way, stage
-from halfspace_sss.extensions import renderer
 
 SIDE, SPP = 40, 32
 
@@ -91,16 +92,15 @@ def with_flip(
         images: of `small_images`, if they have been rendered, with `spp` samples a pixel.
         spp: samples for each pixel.
     """
-    flip = renderer("flip")
-    if flip is None or all(o.is_dark for o in assessment.objects):
+    if find_spec("flip_evaluator") is None or all(o.is_dark for o in assessment.objects):
         return assessment
     measured = {PATH_TRACED, *(w.way for o in assessment.objects for w in o.ways if not w.refusal)}
     shown = [way for way in chosen if way.name in measured]  # others would gather light for a number that is not told
     images = small_images(on, shown, sensor, seed, spp=spp) if images is None else images
     truth = images[PATH_TRACED]
     again = small_images(on, [chosen[0]], sensor, seeded(seed, 52), max(truth.shape), spp)[PATH_TRACED]
-    noise = flip(truth, again)
-    values = {name: noise if name == PATH_TRACED else flip(truth, image) for name, image in images.items()}
+    noise = mean_flip(truth, again)
+    values = {name: noise if name == PATH_TRACED else mean_flip(truth, image) for name, image in images.items()}
     objects = []
     for o in assessment.objects:
         rows = tuple(replace(w, flip=values.get(w.way), flip_noise=noise) if not w.refusal else w for w in o.ways)
@@ -109,7 +109,7 @@ def with_flip(
 
 
 # --------------------------------------------------------------------------------------------------
-# What the figure of a trade is drawn from: an entry point "trade" of `halfspace_sss.figures` takes it.
+# What the figure of a trade is drawn from.
 
 
 PAGE_SIDE = 128  # of the images of the page

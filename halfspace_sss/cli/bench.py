@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from enum import Enum
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-from halfspace_sss.checks import did_you_mean
-from halfspace_sss.cli.shared import Bar, OutFolder, console
-from halfspace_sss.provenance import check_folder, provenance, write_together
+from halfspace_sss.cli import shared
 
-if TYPE_CHECKING:
-    from rich.table import Table
 
-PARTS = ("walk", "volpath", "models", "maps")
+class BenchPart(str, Enum):
+    """What is measured."""
+
+    walk = "walk"
+    volpath = "volpath"
+    models = "models"
+    maps = "maps"
+
+
+PARTS = tuple(part.value for part in BenchPart)
 SECONDS = {"walk": 1, "volpath": 15, "models": 3, "maps": 100}  # about, for a row; only the time left depends on it
 TITLES = {
     "walk": "walk at normal incidence, flux alone or with peel-off towards one direction",
@@ -38,26 +44,21 @@ COLUMNS = {  # key of a row -> heading and format
 }  # fmt: skip
 
 
-def chosen_parts(text: str | None) -> list[str]:
-    """The parts to measure, in the order of `PARTS`; volpath is compared with the walk and brings it along.
-
-    Raises:
-        ValueError: an entry is no part (the nearest is given), or there is none.
-    """
-    asked = list(PARTS) if text is None else [part.strip() for part in text.split(",")]
-    for part in asked:
-        if part not in PARTS:
-            hint = did_you_mean(part, PARTS)
-            raise ValueError(f"only must list parts of {', '.join(PARTS)}, got {part!r}{hint}")
+def chosen_parts(asked: Sequence[str] | None) -> list[str]:
+    """The parts to measure, in the order of `PARTS`; volpath is compared with the walk and brings it along."""
+    asked = asked or PARTS
     return [part for part in PARTS if part in asked or (part == "walk" and "volpath" in asked)]
 
 
-def bench_command(
-    only: Annotated[str | None, typer.Option(help="Parts, of walk,volpath,models,maps.", show_default="all")] = None,
+def bench(
+    only: Annotated[list[BenchPart] | None, typer.Option(help="A part; repeat for more.", show_default="all")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Small runs that only show that everything works.")] = False,
-    out: OutFolder = Path("bench"),
+    out: shared.OutFolder = Path("bench"),
 ) -> None:
     """Measure speed: events and paths per second, equal-error time of volpath, evaluations of models, maps."""
+    from halfspace_sss.comparison.bench import machine, peak_memory
+    from halfspace_sss.provenance import check_folder, provenance, write_together
+
     parts, notes = chosen_parts(only), []
     check_folder(out)
     if "volpath" in parts and find_spec("mitsuba") is None:
@@ -65,15 +66,22 @@ def bench_command(
         notes.append("volpath is left out: Mitsuba is not installed (`pip install halfspace-sss[render]`)")
     if "models" in parts and find_spec("torch") is None:
         notes.append("the models are not measured in torch, which is not installed")
-    tables = _measured(parts, quick)
-    content, memory = _content(tables, quick, notes)
-    write_together({out / name: text for name, text in content.items()})
-    screen = console()
-    for part, rows in tables.items():
-        screen.print(TITLES[part], _table(rows), sep="\n")
-    peak = "" if memory is None else f"peak memory {memory:.2f} GiB; "
-    for line in (*notes, f"{peak}written:", *(f"  {out / name}" for name in content)):
-        screen.print(line, highlight=False, markup=False, soft_wrap=True)
+    measured = _measured(parts, quick)
+
+    import pandas
+
+    memory = peak_memory()
+    files = {out / f"bench_{part}.csv": shared.csv_of(pandas.DataFrame(rows)) for part, rows in measured.items()}
+    about = {"provenance": provenance(quick=quick, parts=parts), "machine": machine(), "notes": notes}
+    about |= {"peak_memory_gib": memory, **measured}
+    files[out / "bench.json"] = json.dumps(about, indent=1, allow_nan=False) + "\n"
+    write_together(files)
+    for part, rows in measured.items():
+        keys = [key for key in rows[0] if key in COLUMNS]
+        cells = [[_cell(key, row[key]) for key in keys] for row in rows]
+        shared.say(TITLES[part], shared.table([COLUMNS[key][0] for key in keys], cells))
+    shared.say(*notes, *([] if memory is None else [f"peak memory {memory:.2f} GiB"]), "written:")
+    shared.say_files(files)
 
 
 def _measured(parts: list[str], quick: bool) -> dict[str, list[dict]]:
@@ -81,7 +89,7 @@ def _measured(parts: list[str], quick: bool) -> dict[str, list[dict]]:
     tables: dict[str, list[dict]] = {part: [] for part in parts}
     lengths = _lengths(quick)
     total, done = sum(SECONDS[part] * lengths[part] for part in parts), 0
-    with Bar("measuring") as bar:
+    with shared.Bar("measuring") as bar:
         for part in parts:
             bar.show(done, total, part)
             for row in _rows(part, quick, tables):
@@ -95,11 +103,9 @@ def _measured(parts: list[str], quick: bool) -> dict[str, list[dict]]:
 def _lengths(quick: bool) -> dict[str, int]:
     """Number of rows of each part."""
     from halfspace_sss import models
-    from halfspace_sss.comparison import bench
+    from halfspace_sss.comparison.bench import MAP_MEDIA, MEDIA, ROULETTE_DEPTHS
 
-    media = 1 if quick else len(bench.MEDIA)
-    depths = 1 if quick else len(bench.ROULETTE_DEPTHS)
-    maps = 1 if quick else len(bench.MAP_MEDIA)
+    media, depths, maps = (1 if quick else len(each) for each in (MEDIA, ROULETTE_DEPTHS, MAP_MEDIA))
     return {"walk": 2 * media, "volpath": media * depths, "models": len(models()), "maps": maps}
 
 
@@ -114,36 +120,6 @@ def _rows(part: str, quick: bool, tables: dict[str, list[dict]]) -> Iterator[dic
     if part == "models":
         return bench.bench_models(n=1024, least_seconds=0.01) if quick else bench.bench_models()
     return bench.bench_maps(1.0, MapGrid(2, 16, 8, 8), bench.MAP_MEDIA[:1]) if quick else bench.bench_maps()
-
-
-def _content(tables: dict[str, list[dict]], quick: bool, notes: list[str]) -> tuple[dict[str, str], float | None]:
-    """Text of each file by name, and the peak memory, GiB."""
-    import pandas
-
-    from halfspace_sss.comparison.bench import machine, peak_memory
-
-    memory = peak_memory()
-    texts = {
-        f"bench_{part}.csv": pandas.DataFrame(rows).to_csv(index=False, lineterminator="\n")
-        for part, rows in tables.items()
-    }
-    about = {"provenance": provenance(quick=quick, parts=list(tables)), "machine": machine(), "notes": notes}
-    about |= {"peak_memory_gib": memory, **tables}
-    texts["bench.json"] = json.dumps(about, indent=1, allow_nan=False) + "\n"
-    return texts, memory
-
-
-def _table(rows: list[dict]) -> Table:
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
-    keys = [key for key in rows[0] if key in COLUMNS]
-    table = Table(box=SIMPLE_HEAD, pad_edge=False)
-    for key in keys:
-        table.add_column(COLUMNS[key][0], justify="left" if isinstance(rows[0][key], str) else "right")
-    for row in rows:
-        table.add_row(*(_cell(key, row[key]) for key in keys))
-    return table
 
 
 def _cell(key: str, value: Any) -> str:

@@ -1,19 +1,20 @@
-"""What several commands share: numbers and media, progress on stderr, tables on stdout, --quiet, and how commands end.
+"""What commands share: their options, progress on stderr, tables on stdout, --quiet, and how they end.
 
 Errors become a line on stderr and an exit code: 0 done, 1 failed, 2 bad input, 130 interrupted (143 terminated).
 """
 
 from __future__ import annotations
 
-import functools
+import dataclasses
 import inspect
 import math
 import time
+import typing
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from typer.core import TyperGroup
@@ -24,9 +25,14 @@ from halfspace_sss.cli.interrupts import interrupts
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
+    import pandas
     from rich.console import Console
+    from rich.table import Table
 
     from halfspace_sss.physics.medium import Medium
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Groups and commands, and how they end
 
 
 def _end(message: str, code: int) -> typer.Exit:
@@ -47,7 +53,7 @@ def _show_warning(message: Any, *_: Any) -> None:
 
 
 class Commands(TyperGroup):
-    """The commands; what the library refuses, and interrupts, end them in a line."""
+    """The commands; what they and the library refuse, and interrupts, end them in a line."""
 
     def invoke(self, ctx: Any) -> Any:
         with interrupts, warnings.catch_warnings():
@@ -67,12 +73,63 @@ class Commands(TyperGroup):
         except ValueError as error:
             interrupts.check()
             raise _end(f"error: {error}", 2) from error
+        except typer.TyperException as error:
+            message = error.format_message().replace("Value error, ", "")
+            if not message:  # a group without a command has shown its help
+                raise
+            raise _end(f"error: {message}", error.exit_code) from None
         except BrokenPipeError:
             raise  # the reader, `head` for instance, has what it wanted: typer ends in silence
         except (BackendError, OSError) as error:
             interrupts.check()
             raise _end(f"error: {error}", 1) from error
 
+
+def group(help: str, cls: type[TyperGroup] | None = None, completion: bool = False) -> typer.Typer:
+    """A group of commands, to which `add` adds."""
+    return typer.Typer(
+        cls=cls, help=help, no_args_is_help=True, add_completion=completion, pretty_exceptions_enable=False,
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )  # fmt: skip
+
+
+def add(app: typer.Typer, name: str, function: Callable) -> None:
+    """Add a command to a group.
+
+    A parameter of the function may be a record, a dataclass of values with typer annotations and defaults, each of
+    which is an option. Every command has the option --quiet beside its own.
+    """
+    parameters, records = [], {}
+    for parameter in inspect.signature(function, eval_str=True).parameters.values():
+        if dataclasses.is_dataclass(parameter.annotation):
+            records[parameter.name] = parameter.annotation
+            kinds = typing.get_type_hints(parameter.annotation, include_extras=True)
+            for field in dataclasses.fields(parameter.annotation):
+                option = inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default)
+                parameters.append(option.replace(annotation=kinds[field.name]))
+        else:
+            parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+
+    def run(quiet: bool, **options: Any) -> Any:
+        made = {
+            key: record(**{field.name: options.pop(field.name) for field in dataclasses.fields(record)})
+            for key, record in records.items()
+        }
+        set_quiet(quiet)
+        try:
+            return function(**options, **made)
+        finally:
+            set_quiet(False)
+
+    kind = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but warnings and errors.")]
+    parameters.append(inspect.Parameter("quiet", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=kind))
+    run.__signature__ = inspect.Signature(parameters)
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    app.command(name, help=inspect.getdoc(function))(run)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What is printed
 
 TABLE_WIDTH = 132  # where the output is no terminal
 LINE_EVERY = 30.0  # seconds
@@ -94,10 +151,44 @@ def console() -> Console:
     return result if result.is_terminal else Console(width=TABLE_WIDTH, quiet=_quiet)
 
 
+def say(*lines: object) -> None:
+    """Results on stdout, as they are."""
+    screen = console()
+    for line in lines:
+        screen.print(line, highlight=False, markup=False, soft_wrap=isinstance(line, str))
+
+
+def say_files(paths: Iterable[Path | str]) -> None:
+    """Paths that were written, a line each."""
+    say(*(f"  {path}" for path in paths))
+
+
 def tell(sentence: str) -> None:
     """A sentence on stderr, before work starts."""
     if not _quiet:
         typer.echo(sentence, err=True)
+
+
+def table(
+    headings: Sequence[str], rows: Iterable[Sequence[str]], *, title: str = "", caption: str = "", left: int = 1
+) -> Table:
+    """A table of texts, of which the first `left` columns are words and the others numbers."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+    from rich.text import Text
+
+    about = {"title": Text(title) if title else None, "caption": Text(caption) if caption else None}
+    result = Table(**about, title_justify="left", caption_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    for k, heading in enumerate(headings):
+        result.add_column(Text(heading), justify="left" if k < left else "right", overflow="fold")
+    for row in rows:
+        result.add_row(*(Text(cell) for cell in row))
+    return result
+
+
+def csv_of(frame: pandas.DataFrame) -> str:
+    """The text of a CSV file."""
+    return frame.to_csv(index=False, lineterminator="\n")
 
 
 class Bar:
@@ -130,6 +221,10 @@ class Bar:
             self._shown = _Moving(self._title, screen, done) if screen.is_terminal else _Lines(self._title)
         self._total = total
         self._shown.show(done, total, text)
+
+    def told(self, what: str, done: int, total: int) -> None:
+        """`show`, in the order in which libraries call a progress."""
+        self.show(done, total, what)
 
     @contextmanager
     def standing(self) -> Iterator[None]:
@@ -192,6 +287,10 @@ class _Lines:
             typer.echo(f"{self._title} 100 % after {time.monotonic() - self._started:.0f} s", err=True)
 
 
+# ---------------------------------------------------------------------------------------------------------------------
+# Options
+
+
 def whole(text: str | int) -> int:
     """A whole number as people write it, 1e6 too; the parser of an option, which gets its default as well."""
     try:
@@ -207,70 +306,83 @@ def whole(text: str | int) -> int:
     return int(value)
 
 
-SigmaT = Annotated[float | None, typer.Option(help="Extinction, 1/mm.", show_default="0.241")]
-Albedo = Annotated[float | None, typer.Option(help="Single-scattering albedo.", show_default="0.75")]
-MeanCosine = Annotated[float | None, typer.Option(help="Mean cosine of the phase function.", show_default="0")]
-Eta = Annotated[float | None, typer.Option(help="Index inside over outside.", show_default="1.3")]
-Materials = Annotated[list[str] | None, typer.Argument(help="Names of materials; see `halfspace-sss materials`.")]
+def _seed(text: str | int) -> int:
+    value = whole(text)
+    if value < 0:
+        raise typer.BadParameter(f"seed must be a whole number >= 0, got {value}.")
+    return value
+
+
+def _complete_models() -> list[str]:
+    from halfspace_sss import models
+
+    return list(models())
+
+
+def _complete_materials() -> list[str]:
+    from halfspace_sss.materials import names
+
+    return list(names())
+
+
+MATERIALS_HELP = "Names of materials; see `halfspace-sss materials list`."
+Materials = Annotated[list[str] | None, typer.Argument(help=MATERIALS_HELP, autocompletion=_complete_materials)]
+OneMaterial = Annotated[str | None, typer.Argument(help="Name of a material.", autocompletion=_complete_materials)]
 Channels = Annotated[str | None, typer.Option(help="Only these, as R,B.", show_default="all")]
+Models = Annotated[
+    list[str] | None,
+    typer.Option(help="A model; repeat for more.", metavar="NAME", show_default="all", autocompletion=_complete_models),
+]
 ObjectId = Annotated[str | None, typer.Option(help="Its id in the scene.", show_default="the only translucent one")]
 SensorNumber = Annotated[int, typer.Option(help="Number of the sensor.", parser=whole)]
-SampleSeed = Annotated[int, typer.Option(help="Seed of the samples.", parser=whole)]
+Seed = Annotated[int, typer.Option(help="Seed of random numbers.", parser=_seed)]
 OutFolder = Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")]
-Backend = Annotated[str, typer.Option(help="llvm or cuda.")]
-SPECTRAL = ("llvm_ad_spectral", "cuda_ad_spectral")
-Workers = Annotated[
-    int | None,
-    typer.Option(help="Processes that share the cores and the parts of the work.", parser=whole, show_default="none"),
-]
-Scheduler = Annotated[
-    str | None,
-    typer.Option(
-        help="Address or file of a Dask scheduler, whose workers do the work; local starts one.", show_default="none"
-    ),
-]
+Backend = Annotated[Literal["llvm", "cuda"], typer.Option(help="Where the walks run.")]
+AsJson = Annotated[bool, typer.Option("--json", help="As JSON, for programs.")]
 Define = Annotated[
     list[str] | None,
     typer.Option("--define", "-D", help="Value of $NAME in the scene; repeat for more.", metavar="NAME=VALUE"),
 ]
 
 
-@contextmanager
-def executor_of(workers: int | None, scheduler: str | None) -> Iterator[Executor | None]:
-    """Where parts run: None stands for this process."""
-    from halfspace_sss import executors
+@dataclasses.dataclass(frozen=True)
+class MediumOptions:
+    """A medium that is stated; what is left out is that of Fig. 10."""
 
-    if workers is not None and scheduler is not None:
-        raise ValueError(f"workers must be left out beside a scheduler, got {workers}")
-    if scheduler is not None:
-        with executors.scheduler(scheduler, console().print) as result:
-            yield result
-    elif workers is not None:
-        with executors.workers(workers) as result:
-            yield result
-    else:
-        yield None
+    sigma_t: Annotated[float | None, typer.Option(help="Extinction, 1/mm.", show_default="0.241")] = None
+    albedo: Annotated[float | None, typer.Option(help="Single-scattering albedo.", show_default="0.75")] = None
+    g: Annotated[float | None, typer.Option(help="Mean cosine of the phase function.", show_default="0")] = None
+    eta: Annotated[float | None, typer.Option(help="Index inside over outside.", show_default="1.3")] = None
 
+    def stated(self, materials: Sequence[str]) -> Medium | None:
+        """The medium; None if no coefficient was given.
 
-def numbers(name: str, text: str) -> list[float]:
-    """Comma-separated numbers; ValueError with the name of the option."""
-    try:
-        return [float(part) for part in text.split(",")]
-    except ValueError:
-        raise ValueError(f"{name} must be numbers separated by commas, got {text!r}") from None
+        Raises:
+            ValueError: coefficients were given beside the name of a material, or are out of range.
+        """
+        given = {name: value for name, value in vars(self).items() if value is not None}
+        for name, value in given.items():
+            if materials:
+                raise ValueError(f"{name} must be left out for a named material, got {value!r} with {materials[0]!r}")
+        return fig10_medium(**given) if given else None
 
+    def media(self, materials: Sequence[str], channels: str | None) -> dict[str, Medium]:
+        """Media by title: of materials, of their channels, as in "R,B", those stated, or that of Fig. 10."""
+        from halfspace_sss.materials import load
+        from halfspace_sss.materials.registry import one_channel
 
-def stated_medium(materials: list[str], given: dict[str, float | None]) -> Medium | None:
-    """The medium of Fig. 10 with the coefficients that were given; None if none was.
-
-    Raises:
-        ValueError: coefficients were given beside the name of a material, or are out of range.
-    """
-    stated = {name: value for name, value in given.items() if value is not None}
-    for name, value in stated.items():
-        if materials:
-            raise ValueError(f"{name} must be left out for a named material, got {value!r} with {materials[0]!r}")
-    return fig10_medium(**stated) if stated else None
+        stated = self.stated(materials)
+        if channels is not None and not materials:
+            raise ValueError(f"channel must be left out unless materials are named, got {channels!r}")
+        if channels is not None:
+            chosen = [one_channel(name, channel.strip()) for name in materials for channel in channels.split(",")]
+        elif stated is None:
+            chosen = [(each.name, each.medium) for each in map(load, materials or ["fig10"])]
+        else:
+            chosen = [("medium", stated)]
+        if len(dict(chosen)) < len(chosen):
+            raise ValueError(f"materials and channels must be different, got {', '.join(title for title, _ in chosen)}")
+        return dict(chosen)
 
 
 def fig10_medium(**stated: float) -> Medium:
@@ -283,50 +395,53 @@ def fig10_medium(**stated: float) -> Medium:
     return Medium.from_albedo(**{**known, **stated})
 
 
-def by_channel(names: list[str], channels: str) -> list[tuple[str, Medium]]:
-    """A title and a scalar medium for each of the channels, as in "R,B", of each material."""
-    from halfspace_sss.materials.registry import one_channel
+@dataclasses.dataclass(frozen=True)
+class Places:
+    """Where the parts of the work run."""
 
-    return [one_channel(name, channel.strip()) for name in names for channel in channels.split(",")]
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            help="Processes that share the cores and the parts of the work.", parser=whole, show_default="none"
+        ),
+    ] = None
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            help="Address or file of a Dask scheduler, whose workers do the work; local starts one.",
+            show_default="none",
+        ),
+    ] = None
+
+    @contextmanager
+    def executor(self) -> Iterator[Executor | None]:
+        """What runs the parts; None stands for this process."""
+        from halfspace_sss import executors
+
+        if self.workers is not None and self.scheduler is not None:
+            raise ValueError(f"workers must be left out beside a scheduler, got {self.workers}")
+        if self.scheduler is not None:
+            with executors.scheduler(self.scheduler, console().print) as result:
+                yield result
+        elif self.workers is not None:
+            with executors.workers(self.workers) as result:
+                yield result
+        else:
+            yield None
 
 
-def check_channel(channel: str | None, names: list[str]) -> None:
-    """ValueError if channels are chosen and no material is."""
-    if channel is not None and not names:
-        raise ValueError(f"channel must be left out unless materials are named, got {channel!r}")
+def numbers(name: str, text: str) -> list[float]:
+    """Comma-separated numbers; ValueError with the name of the option."""
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise ValueError(f"{name} must be numbers separated by commas, got {text!r}") from None
 
 
-def defined(texts: list[str] | None) -> dict[str, str]:
+def defined(texts: Sequence[str] | None) -> dict[str, str]:
     """Values of $NAME from texts NAME=VALUE."""
     pairs = [text.partition("=") for text in texts or ()]
-    for text, (name, equals, _) in zip(texts or (), pairs):
+    for name, equals, value in pairs:
         if not (name.isidentifier() and equals):
-            raise ValueError(f"define must be NAME=VALUE, got {text!r}")
+            raise ValueError(f"define must be NAME=VALUE, got {name + equals + value!r}")
     return {name: value for name, _, value in pairs}
-
-
-def check_left_out(names: dict[str, Any], beside: str) -> None:
-    """ValueError if one of the options, by name, was given where `beside` says that it has no place."""
-    for name, value in names.items():
-        if value not in (None, False, []):
-            raise ValueError(f"{name} must be left out {beside}, got {value!r}")
-
-
-def with_quiet(command: Callable) -> Callable:
-    """The command with a further option, --quiet."""
-
-    @functools.wraps(command)
-    def silenced(*arguments: Any, quiet: bool = False, **options: Any) -> Any:
-        set_quiet(quiet)
-        try:
-            return command(*arguments, **options)
-        finally:
-            set_quiet(False)
-
-    result = inspect.signature(command, eval_str=True)
-    kind = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but warnings and errors.")]
-    option = inspect.Parameter("quiet", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=kind)
-    silenced.__signature__ = result.replace(parameters=[*result.parameters.values(), option])
-    silenced.__annotations__ = {**{p.name: p.annotation for p in result.parameters.values()}, "quiet": kind}
-    del silenced.__wrapped__  # of which the signature would be read
-    return silenced

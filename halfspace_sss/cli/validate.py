@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from halfspace_sss.checks import check_count
-from halfspace_sss.cli.shared import Bar, console, whole
-from halfspace_sss.comparison.truths import MEASURES, Z_LIMIT, Comparison, Truth, Validation, validate
-from halfspace_sss.provenance import check_folder, provenance, write_together
+from halfspace_sss.cli.shared import Bar, Seed, csv_of, say, table
+
+if TYPE_CHECKING:
+    from halfspace_sss.comparison.truths import Comparison, Truth, Validation
 
 KINDS = ("published", "thirdparty", "exact")
 
@@ -27,6 +25,8 @@ def row_filter(text: str | None) -> Callable[[Truth], bool] | None:
     Raises:
         ValueError: an entry is none of these.
     """
+    from halfspace_sss.comparison.truths import MEASURES
+
     if not text:
         return None
     wanted = {part.strip() for part in text.split(",") if part.strip()}
@@ -78,11 +78,12 @@ def _record(c: Comparison) -> dict[str, Any]:
 
 def write_results(result: Validation, folder: Path) -> None:
     """Write validate.csv (a line per row) and validate.json (rows, summary, rows not covered, provenance)."""
+    import pandas
+
+    from halfspace_sss.comparison.truths import Z_LIMIT
+    from halfspace_sss.provenance import provenance, write_together
+
     records = [_record(c) for c in result.comparisons]
-    text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=list(records[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(records)
     content = {
         "provenance": provenance(seed=result.seed, quick=result.quick, z_limit=Z_LIMIT),
         "seconds": result.seconds,
@@ -92,7 +93,7 @@ def write_results(result: Validation, folder: Path) -> None:
         "rows": records,
     }
     about = json.dumps(_strict(content), indent=1, allow_nan=False) + "\n"
-    write_together({folder / "validate.csv": text.getvalue(), folder / "validate.json": about})
+    write_together({folder / "validate.csv": csv_of(pandas.DataFrame(records)), folder / "validate.json": about})
 
 
 def _strict(value: Any) -> Any:
@@ -104,39 +105,34 @@ def _strict(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def validate_command(
+def validate(
     out: Annotated[Path | None, typer.Option(help="Folder for validate.csv and validate.json.")] = None,
-    seed: Annotated[int, typer.Option(help="Seed of all runs.", parser=whole)] = 0,
-    quick: Annotated[bool, typer.Option(help="Ten times looser standard errors.")] = False,
+    seed: Seed = 0,
+    quick: Annotated[bool, typer.Option("--quick", help="Ten times looser standard errors.")] = False,
     rows: Annotated[str | None, typer.Option(help="Only these ids, measures (R_d, BRDF, ...) or kinds.")] = None,
 ) -> None:
     """Trace every published, third-party or exact half-space number of the packaged table and compare."""
-    check_count("seed", seed, 0)
+    from halfspace_sss.comparison import truths
+    from halfspace_sss.provenance import check_folder
+
     if out is not None:
         check_folder(out)
     with Bar("tracing") as bar:
-        result = validate(row_filter(rows), seed, quick, progress=bar.show)
+        result = truths.validate(row_filter(rows), seed, quick, progress=bar.show)
     if out is not None:
         write_results(result, out)
-    _print(console(), result)
+    cells = [
+        (s["quantity"], f"{s['rows']}", f"{s['max_abs_z']:.2f}", f"{s['rms_z']:.2f}", f"{s['max_relative_error']:.1e}")
+        for s in summary(result.comparisons)
+    ]
+    headings = ("quantity", "rows", "max |z|", "rms z", "largest relative error")
+    say(table(headings, cells, title="traced against truths.csv"))
+    for reason, count in Counter(n.reason for n in result.not_covered).most_common():
+        say(f"not covered: {count} rows: {reason}")
+    for c in result.failures:
+        truth = f"truth {c.truth.value:.8g} ± {c.truth.uncertainty:.1e}, z = {c.z:.2f}"
+        say(f"{c.truth.id} {c.truth.quantity}: traced {c.traced:.8g} ± {c.standard_error:.1e}, {truth}")
+    verdict = f"{len(result.failures)} of {len(result.comparisons)} rows have |z| >= {truths.Z_LIMIT:g}"
+    say(f"{verdict}; {result.seconds:.0f} s")
     if result.failures:
         raise typer.Exit(1)
-
-
-def _print(screen: Any, result: Validation) -> None:
-    from rich.table import Table
-
-    table = Table("quantity", "rows", "max |z|", "rms z", "largest relative error", title="traced against truths.csv")
-    for s in summary(result.comparisons):
-        numbers = (f"{s['max_abs_z']:.2f}", f"{s['rms_z']:.2f}", f"{s['max_relative_error']:.1e}")
-        table.add_row(s["quantity"].replace("[", r"\["), str(s["rows"]), *numbers)
-    screen.print(table)
-    for reason, count in Counter(n.reason for n in result.not_covered).most_common():
-        screen.print(f"not covered: {count} rows: {reason}", highlight=False)
-    for c in result.failures:
-        screen.print(
-            f"[red]{c.truth.id}[/red] {c.truth.quantity.replace('[', chr(92) + '[')}: traced {c.traced:.8g} ± "
-            f"{c.standard_error:.1e}, truth {c.truth.value:.8g} ± {c.truth.uncertainty:.1e}, z = {c.z:.2f}"
-        )
-    verdict = f"{len(result.failures)} of {len(result.comparisons)} rows have |z| >= {Z_LIMIT:g}"
-    screen.print(f"{verdict}; {result.seconds:.0f} s", highlight=False)

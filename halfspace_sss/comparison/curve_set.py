@@ -6,16 +6,17 @@ import base64
 import io
 import json
 import math
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from html import escape
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from halfspace_sss.backend import BackendError
-from halfspace_sss.extensions import FAILURES, FIGURES, renderer, warn_left_out
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder, provenance, write_together
 
@@ -111,11 +112,10 @@ class CurveSet:
 
     def _drawn(self) -> str:
         """The plot as a page shows it; nothing without matplotlib."""
-        draw = renderer("curves_figure")
-        if draw is None:
+        if not _can_draw():
             return ""
         file = io.BytesIO()
-        draw(self).savefig(file, format="png")
+        self.plot().savefig(file, format="png")
         return f'<img src="data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}">'
 
     def plot(self) -> Any:
@@ -124,9 +124,10 @@ class CurveSet:
         Raises:
             BackendError: matplotlib is not installed.
         """
-        draw = renderer("curves_figure")
-        if draw is None:
+        if not _can_draw():
             raise BackendError('plot needs matplotlib: pip install "halfspace-sss[figures]"')
+        from halfspace_sss.comparison.curve_plot import draw
+
         return draw(self)
 
     @property
@@ -249,11 +250,14 @@ class CurveSet:
 
     def _figures(self) -> dict[str, bytes]:
         """The figure by file ending; none, with a warning, if it cannot be drawn."""
-        render = renderer("curves")
+        if not _can_draw():
+            return {}
+        from halfspace_sss.comparison import curve_plot
+
         try:
-            return {} if render is None else dict(render(self))
-        except FAILURES as error:
-            warn_left_out(FIGURES, "curves", error)
+            return curve_plot.render(self)
+        except Exception as error:  # a font, a full memory: the numbers took longer than the figure will
+            warnings.warn(f"the figure could not be drawn: {type(error).__name__}: {error}", stacklevel=2)
             return {}
 
     def _write(self, folder: Path, name: str, content: dict[str, Any]) -> list[Path]:
@@ -262,6 +266,10 @@ class CurveSet:
         content = {**content, f"{name}.json": json.dumps({**about, "files": sorted(content)}, indent=1) + "\n"}
         write_together({folder / file: data for file, data in content.items()})
         return [folder / file for file in content]
+
+
+def _can_draw() -> bool:
+    return find_spec("matplotlib") is not None
 
 
 def range_edges(r_edges: np.ndarray) -> list[float]:

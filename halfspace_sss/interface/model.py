@@ -467,7 +467,7 @@ def model_class(name: str) -> type[BSSRDF]:
     if name not in known and name in offers(TRANSPORTS):
         raise ValueError(
             f"model must be one of the half-space here, got {name!r}, which is one of objects in a scene: "
-            "`halfspace-sss errors --scene` and `render` take it"
+            "`halfspace-sss errors object` and `render` take it"
         )
     check_choice("model", name, known)
     return known[name]

@@ -47,7 +47,7 @@ class Registry:
             raise ValueError(f"material must be a name, got {name!r}")
         if key_of(name) not in materials:
             hint = did_you_mean(key_of(name), {key: m.name for key, m in materials.items()}, most=3)
-            hint = hint or "; `halfspace-sss materials` lists them"
+            hint = hint or "; `halfspace-sss materials list` lists them"
             raise ValueError(f"material must be one of the {len(materials)} registered, got {name!r}{hint}")
         return materials[key_of(name)]
 

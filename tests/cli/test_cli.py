@@ -15,7 +15,7 @@ import pytest
 from typer.testing import CliRunner
 
 import halfspace_sss
-from figures import command_line as cli
+from figures import app as cli
 from halfspace_sss.backend import BackendError
 
 QUICK = ["curves", "--paths", "4096", "--theta-i", "0,60", "--model", "better_dipole"]
@@ -84,7 +84,7 @@ def test_a_material_is_compared_by_name_and_channel(tmp_path: Path) -> None:
 
 
 def test_without_matplotlib_there_are_tables_and_a_hint(tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.setattr("halfspace_sss.comparison.curve_set.renderer", lambda kind: None)
+    monkeypatch.setattr("halfspace_sss.comparison.curve_set.find_spec", lambda name: None)
     result = _invoke(*QUICK, "--out", str(tmp_path))
     assert result.exit_code == 0
     assert "pip install halfspace-sss[figures]" in result.stdout
@@ -103,10 +103,10 @@ def test_without_matplotlib_there_are_tables_and_a_hint(tmp_path: Path, monkeypa
         (["--theta-i", "90"], "theta_i_deg must be a number in [0, 90) degrees, got 90.0"),
         (["--r-min", "30"], "r_min must be < r_max = 25 mm, got 30"),
         (["--model", "beter_dipole"], "did you mean 'better_dipole'?"),
-        (["--orders", "single"], "orders must be 'multiple' or 'total', got 'single'"),
+        (["--orders", "single"], "'single' is not one of 'multiple', 'total'"),
         (["--line", "0", "--orders", "total"], "orders must be 'multiple' on a line where the refracted rays meet"),
         (["--paths", "3"], "n_paths must be a whole number >= 256, got 3"),
-        (["--backend", "metal"], "backend must be one of llvm, cuda, got 'metal'"),
+        (["--backend", "metal"], "'metal' is not one of 'llvm', 'cuda'"),
     ],
 )
 def test_bad_input_gives_one_line_and_exit_code_2_and_no_file(
@@ -160,7 +160,7 @@ def test_typing_mistakes_end_with_2_and_name_what_was_meant(arguments: list[str]
 
 @pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
 def test_an_interrupted_run_ends_with_130_and_leaves_no_file(tmp_path: Path) -> None:
-    code = "import figures.command_line; from figures.command_line import main; print('ready', flush=True); main()"
+    code = "import figures.app; from figures.command_line import main; print('ready', flush=True); main()"
     command = [sys.executable, "-c", code, "curves", "--paths", "4000000000"]
     process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stdout.readline() == "ready\n"
@@ -192,7 +192,7 @@ def test_a_missing_backend_ends_with_1_and_its_message(monkeypatch: Any) -> None
 def test_a_reader_that_closes_the_pipe_hears_no_complaint(tmp_path: Path) -> None:
     reader, writer = os.pipe()
     os.close(reader)
-    run = subprocess.run([*START, "materials", "marble"], stdout=writer, stderr=subprocess.PIPE, text=True)
+    run = subprocess.run([*START, "materials", "show", "marble"], stdout=writer, stderr=subprocess.PIPE, text=True)
     os.close(writer)
     assert (run.returncode, run.stderr) == (1, "")
 
@@ -210,20 +210,20 @@ def test_models_are_listed_with_orders_and_source() -> None:
 
 
 def test_materials_are_listed() -> None:
-    result = _invoke("materials")
+    result = _invoke("materials", "list")
     assert result.exit_code == 0
     for name in ("marble", "ketchup", "fig10"):
         assert name in result.stdout
 
 
 def test_one_material_is_shown_with_its_source() -> None:
-    result = _invoke("materials", "Marble")
+    result = _invoke("materials", "show", "Marble")
     assert "SIGGRAPH 2001" in result.stdout
     assert "sigma_t 2.1921" in result.stdout
 
 
 def test_an_unknown_material_is_refused_with_a_near_name() -> None:
-    result = _invoke("materials", "marbel")
+    result = _invoke("materials", "show", "marbel")
     assert result.exit_code == 2
     assert "did you mean 'marble'?" in result.stderr
 

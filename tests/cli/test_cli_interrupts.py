@@ -18,12 +18,12 @@ pytestmark = pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
 START = """
 import sys, time
 from halfspace_sss import materials
-from figures import command_line as cli
+from figures.command_line import main
 def table():
 {body}
 materials.table = table
-sys.argv = ["halfspace-sss", "materials"]
-cli.main()
+sys.argv = ["halfspace-sss", "materials", "list"]
+main()
 """
 
 
@@ -199,7 +199,7 @@ def test_an_interrupt_while_the_command_is_being_imported_ends_with_130_and_one_
     (tmp_path / "halfspace-sss").write_text(SCRIPT)
     (tmp_path / "sitecustomize.py").write_text(SITE.format(module=module))
     path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
-    run = [sys.executable, str(tmp_path / "halfspace-sss"), "materials"]
+    run = [sys.executable, str(tmp_path / "halfspace-sss"), "materials", "list"]
     done = subprocess.run(run, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path})
     assert (done.returncode, done.stdout, done.stderr) == (130, "", LINE)
 

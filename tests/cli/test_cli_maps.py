@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from figures import command_line as cli
+from figures import app as cli
 from halfspace_sss import materials
 from halfspace_sss.maps.store import load_maps
 

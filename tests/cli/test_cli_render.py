@@ -17,15 +17,14 @@ import pytest
 from render_files import BAD_SCENES, START, XML
 from typer.testing import CliRunner
 
-from figures import command_line as cli
-from full_geometry.cli import render as cli_render
+from figures import app as cli
 
 mi = pytest.importorskip("mitsuba")
 
 
 @pytest.fixture
 def scene(tmp_path: Path, monkeypatch: Any) -> Path:
-    monkeypatch.setattr(cli_render, "renderer", lambda kind: None)
+    monkeypatch.setattr(cli, "drawers", lambda: None)
     file = tmp_path / "ball.xml"
     file.write_text(XML)
     return file

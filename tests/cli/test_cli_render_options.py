@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import re
-from importlib import import_module
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from PIL import Image
 from render_files import INTEGRATOR, SENSOR, XML
 from typer.testing import CliRunner
 
-from figures import command_line as cli
+from figures import app as cli
 from full_geometry.cli import render as cli_render
 from full_geometry.scenes import reference
 
@@ -24,10 +23,7 @@ mi = pytest.importorskip("mitsuba")
 
 @pytest.fixture
 def scene(tmp_path: Path, monkeypatch: Any) -> Path:
-    """A scene file; the page is drawn as the project file says, whatever is installed."""
-    text = (Path(__file__).parents[2] / "pyproject.toml").read_text()
-    module, name = re.search(r'^render = "([\w.]+):(\w+)"$', text, re.MULTILINE).groups()
-    monkeypatch.setattr(cli_render, "renderer", lambda kind: getattr(import_module(module), name))
+    """A scene file."""
     file = tmp_path / "ball.xml"
     file.write_text(XML)
     return file
@@ -87,7 +83,7 @@ def test_without_the_denoiser_nothing_is_rendered_in_vain(scene: Path, monkeypat
 
 
 def test_without_figures_there_are_image_and_picture(scene: Path, monkeypatch: Any) -> None:
-    monkeypatch.setattr(cli_render, "renderer", lambda kind: None)
+    monkeypatch.setattr(cli, "drawers", lambda: None)
     assert _render(scene, "--spp", "1").exit_code == 0
     assert _names(scene.parent / "out") == [name for name in SET if not name.endswith("html")]
 
@@ -106,7 +102,7 @@ def test_another_sensor_has_files_of_its_own(scene: Path) -> None:
 
 @pytest.mark.parametrize("asked", ["1,0", "all"])
 def test_several_sensors_are_rendered_by_one_command(asked: str, scene: Path, monkeypatch: Any) -> None:
-    monkeypatch.setattr(cli_render, "renderer", lambda kind: None)
+    monkeypatch.setattr(cli, "drawers", lambda: None)
     scene.write_text(XML.replace("</scene>", SENSOR.replace("0,0,40", "0,40,1") + "</scene>"))
     assert _render(scene, "--spp", "1", "--sensor", asked).exit_code == 0
     found = {path.name: reference.load(path) for path in (scene.parent / "out").glob("*.exr")}
@@ -128,7 +124,7 @@ AOV = '<integrator type="aov"><string name="aovs" value="albedo:albedo,d:depth"/
 
 
 def test_channels_of_aovs_have_their_names(scene: Path, monkeypatch: Any) -> None:
-    monkeypatch.setattr(cli_render, "renderer", lambda kind: None)
+    monkeypatch.setattr(cli, "drawers", lambda: None)
     scene.write_text(XML.replace(INTEGRATOR, AOV.format(INTEGRATOR)))
     for more in ((), ("--resume",)):
         assert _render(scene, "--spp", "2", *more).exit_code == 0
@@ -181,7 +177,7 @@ def test_a_spectral_render_has_a_page_too(scene: Path) -> None:
     assert _names(scene.parent / "out") == SET
 
 
-@pytest.mark.parametrize("command", ["errors", "train material"])
+@pytest.mark.parametrize("command", ["errors materials", "train material"])
 def test_only_the_chosen_channels_are_taken(command: str, monkeypatch: Any, tmp_path: Path) -> None:
     seen = []
 

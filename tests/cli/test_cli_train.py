@@ -10,7 +10,7 @@ import pandas
 import pytest
 from typer.testing import CliRunner
 
-from figures import command_line as cli
+from figures import app as cli
 from halfspace_sss import bssrdf, materials
 from halfspace_sss.maps import noisy_maps
 from halfspace_sss.maps.noisy_maps import CellGrid
@@ -32,6 +32,10 @@ TINY_UNIVERSAL = UniversalRecipe(
 
 def _invoke(*arguments: str) -> Any:
     return CliRunner().invoke(cli.app, list(arguments))
+
+
+def _errors(*arguments: str) -> Any:
+    return _invoke("errors", "materials", *arguments)
 
 
 @pytest.fixture(autouse=True)
@@ -130,18 +134,18 @@ REFUSED_BY_TRAIN = [
     (["no such material"], "material must be one of"),
     (["fig10", "--albedo", "0.5"], "albedo must be left out for a named material"),
     (["--albedo", "1.5"], "albedo must be in [0, 1], got 1.5"),
-    (["--model", "neural"], "model must be one of neural_material, neural_paper, got 'neural'"),
+    (["--model", "neural"], "'neural' is not one of 'neural_material', 'neural_paper'"),
     (["--steps", "0"], "steps must be a whole number >= 1, got 0"),
     (["--seed", "-1"], "seed must be a whole number >= 0, got -1"),
     (["--target-error", "2"], "target_error must be a number in [0.0001, 1], got 2.0"),
-    (["--backend", "opencl"], "backend must be one of llvm, cuda, got 'opencl'"),
+    (["--backend", "opencl"], "'opencl' is not one of 'llvm', 'cuda'"),
     (["--out", "file"], "folder must be a folder or new, got 'file'"),
     (["--work", "file"], "folder must be a folder or new, got 'file"),
 ]
 REFUSED_BY_UNIVERSAL = [
     (["--steps", "-1"], "steps must be a whole number >= 1, got -1"),
     (["--seed", "-1"], "seed must be a whole number >= 0, got -1"),
-    (["--backend", "opencl"], "backend must be one of llvm, cuda, got 'opencl'"),
+    (["--backend", "opencl"], "'opencl' is not one of 'llvm', 'cuda'"),
     (["--out", "file"], "folder must be a folder or new, got 'file'"),
 ]
 REFUSED_BY_ERRORS = [
@@ -154,15 +158,15 @@ REFUSED_BY_ERRORS = [
     (["--model", "neural_material", "--g", "0.01"], "medium must be trained for neural_material, got one that is not"),
     (["--model", "neural", "--g", "0.99"], "g must be in [-0.5, 0.98] for the neural model, got 0.99"),
     (["--events", "10"], "events must be a number in [10000, 1e+12], got 10.0"),
-    (["--block", "3"], "block must be 1, 2, 4 or 8, got 3"),
+    (["--block", "3"], "'3' is not one of '1', '2', '4', '8'"),
     (["--seed", "-1"], "seed must be a whole number >= 0, got -1"),
-    (["--backend", "opencl"], "backend must be one of llvm, cuda, got 'opencl'"),
+    (["--backend", "opencl"], "'opencl' is not one of 'llvm', 'cuda'"),
     (["--out", "file"], "folder must be a folder or new, got 'file'"),
 ]
 REFUSED = [
     *(("train material", *case) for case in REFUSED_BY_TRAIN),
     *(("train universal", *case) for case in REFUSED_BY_UNIVERSAL),
-    *(("errors", *case) for case in REFUSED_BY_ERRORS),
+    *(("errors materials", *case) for case in REFUSED_BY_ERRORS),
 ]
 
 
@@ -181,7 +185,7 @@ def test_bad_input_is_refused_before_any_work(
 
 
 def test_errors_are_written_for_every_model_that_takes_the_medium() -> None:
-    result = _invoke("errors", "--events", "2e4", "--out", "deep/found")
+    result = _errors("--events", "2e4", "--out", "deep/found")
     assert result.exit_code == 0, result.output
     table = pandas.read_csv("deep/found/errors.csv")
     assert {"standard_dipole", "directional_dipole", "neural", "neural_material"} <= set(table["model"])
@@ -192,7 +196,7 @@ def test_errors_are_written_for_every_model_that_takes_the_medium() -> None:
 
 
 def test_errors_of_a_material_are_those_of_its_channels() -> None:
-    assert _invoke("errors", "ketchup", "--events", "2e4", "--model", "standard_dipole").exit_code == 0
+    assert _errors("ketchup", "--events", "2e4", "--model", "standard_dipole").exit_code == 0
     table = pandas.read_csv("errors/errors.csv")
     assert list(table["medium"]) == ["ketchup R", "ketchup G", "ketchup B"]
     assert list(table["albedo"]) == pytest.approx(materials.load("ketchup").medium.albedo)
@@ -200,7 +204,10 @@ def test_errors_of_a_material_are_those_of_its_channels() -> None:
 
 def test_the_json_says_what_an_error_is_and_where_the_numbers_come_from() -> None:
     assert (
-        _invoke("errors", "--events", "2e4", "--model", "better_dipole", "--block", "8", "--seed", "3").exit_code == 0
+        _invoke(
+            "errors", "materials", "--events", "2e4", "--model", "better_dipole", "--block", "8", "--seed", "3"
+        ).exit_code
+        == 0
     )
     content = json.loads(Path("errors/errors.json").read_text())
     assert content["provenance"]["parameters"] == {"events": 2e4, "block": 8, "seed": 3}
@@ -210,19 +217,19 @@ def test_the_json_says_what_an_error_is_and_where_the_numbers_come_from() -> Non
 
 def test_errors_are_repeated_by_their_seed() -> None:
     for out in ("a", "b"):
-        assert _invoke("errors", "--events", "2e4", "--model", "better_dipole", "--out", out).exit_code == 0
+        assert _errors("--events", "2e4", "--model", "better_dipole", "--out", out).exit_code == 0
     assert Path("a/errors.csv").read_bytes() == Path("b/errors.csv").read_bytes()
 
 
 def test_a_trained_material_is_among_the_errors() -> None:
     assert _invoke("train", "material", "--albedo", "0.6").exit_code == 0
-    result = _invoke("errors", "--albedo", "0.6", "--events", "2e4", "--model", "neural_material")
+    result = _errors("--albedo", "0.6", "--events", "2e4", "--model", "neural_material")
     assert result.exit_code == 0 and "neural_material" in result.stdout
 
 
 def test_held_out_media_are_summed_up_by_percentiles_ranges_and_losses() -> None:
     chosen = ("--model", "neural", "--model", "standard_dipole")
-    result = _invoke("errors", "--held-out", "4", "--events", "2e4", *chosen)
+    result = _errors("--held-out", "4", "--events", "2e4", *chosen)
     assert result.exit_code == 0, result.output
     assert len(pandas.read_csv("errors/errors.csv")) == 8
     for words in ("errors over the media", "neural over ranges of media", "has a smaller error than neural"):
@@ -230,4 +237,4 @@ def test_held_out_media_are_summed_up_by_percentiles_ranges_and_losses() -> None
 
 
 def test_held_out_media_can_be_asked_of_one_model_alone() -> None:
-    assert _invoke("errors", "--held-out", "4", "--events", "2e4", "--model", "neural").exit_code == 0
+    assert _errors("--held-out", "4", "--events", "2e4", "--model", "neural").exit_code == 0

@@ -19,11 +19,18 @@ pytestmark = pytest.mark.slow
 SMALL = {  # a small run of each command, and what it refuses
     "bench": (["--quick", "--only", "walk", "--out", "o"], ["--only", "nope"]),
     "curves": (["--paths", "4096", "--theta-i", "0", "--model", "better_dipole", "--out", "o"], ["marbel"]),
-    "errors": (["--model", "better_dipole", "--events", "1e4", "--out", "o"], ["marbel"]),
-    "figures": (["compute", "fig10", "--out", "o"], ["compute", "nope"]),
+    "errors materials": (["--model", "better_dipole", "--events", "1e4", "--out", "o"], ["marbel"]),
+    "errors object": (["--scene", "ball.xml", "--model", "better_dipole", "--out", "o"], ["--scene", "none.xml"]),
+    "errors truths": (["--model", "better_dipole", "--out", "o"], ["--model", "nope"]),
+    "figures all": (["fig10", "--out", "o"], ["nope"]),
+    "figures compute": (["fig10", "--out", "o"], ["nope"]),
+    "figures draw": (["fig10", "--out", "o"], ["nope"]),
+    "figures list": (["fig10", "--out", "o"], ["nope"]),
     "fit": (["ball.xml", "--images", "views.json", "--out", "o"], ["none.xml", "--images", "views.json"]),
     "maps": (["--grid", "2,16,6,4", "--paths", "2048", "--out", "o"], ["marbel"]),
-    "materials": ([], ["marbel"]),
+    "materials import": (["skin.mtlx", "--out", "o/skin.toml"], ["none.mtlx"]),
+    "materials list": ([], ["extra"]),
+    "materials show": (["marble"], ["marbel"]),
     "models": ([], ["extra"]),
     "render": (["ball.xml", "--spp", "4", "--out", "o"], ["none.xml"]),
     "trade": (["ball.xml", "--model", "better_dipole", "--assess", "0.2", "--out", "o"], ["marbel"]),
@@ -39,8 +46,8 @@ from pathlib import Path
 import matplotlib.pyplot, pandas, scipy.interpolate, torch, zarr  # once for all runs: each is a fork
 from halfspace_sss.cli import shared
 from figures.parts import command
-from figures import command_line as cli
-cli._app()
+from figures import app as cli
+from figures.command_line import main
 command.MOST_WORKERS = 1  # the process that is interrupted writes the files, and no other has written some by then
 gc.freeze()
 
@@ -69,14 +76,13 @@ def before(function):
         return function(*arguments, **options)
     return changed
 if moment == "start":
-    made = cli._app()
-    cli._app = before(lambda: made)
+    cli.app = before(cli.app)
 elif moment == "progress":
     shared.Bar.show = before(shared.Bar.show)
 elif moment == "file":
     os.fsync, os.replace = before(os.fsync), before(os.replace)
 try:
-    cli.main()
+    main()
 except SystemExit as end:  # as the interpreter ends, but for its modules, which take half a second
     atexit._run_exitfuncs()
     sys.stdout.flush()
@@ -92,8 +98,11 @@ COLUMNS = {
     "read-only folder": ("none", "locked", "2"),
 }
 MOUNTS = {"full": "size=4k", "locked": "ro"}
-NO_FILES = ("materials", "models")
+NO_FILES = ("materials import", "materials list", "materials show", "models", "figures draw", "figures list")
 LONG = (
+    "errors object",
+    "errors truths",
+    "figures all",
     "fit",
     "train object",
     "train shapes",

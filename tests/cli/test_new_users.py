@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 import halfspace_sss as sss
-from figures import command_line as cli
+from figures import app as cli
 from full_geometry.trade import recommend
 from halfspace_sss.provenance import read_text
 
@@ -26,7 +26,7 @@ def _run(*arguments: str, program: tuple[str, ...] = ("-m", "figures.command_lin
 
 
 def _refused(*arguments: str) -> str:
-    found = CliRunner().invoke(cli._app(), list(arguments))
+    found = CliRunner().invoke(cli.app, list(arguments))
     assert found.exit_code != 0
     return found.output + found.stderr
 
@@ -53,8 +53,8 @@ def test_help_of_the_surface_works_before_it_is_registered() -> None:
 
 
 def test_models_have_one_option_in_all_commands() -> None:
-    for command in ("curves", "errors", "trade"):
-        shown = CliRunner().invoke(cli._app(), [command, "--help"]).output
+    for command in ("curves", "errors materials", "trade"):
+        shown = CliRunner().invoke(cli.app, [*command.split(), "--help"]).output
         assert "--model" in shown
 
 
@@ -68,7 +68,7 @@ def test_a_grid_of_maps_is_refused_by_its_option() -> None:
 
 
 def test_an_unknown_material_is_refused_with_the_command_that_lists_them() -> None:
-    with pytest.raises(ValueError, match="`halfspace-sss materials` lists them"):
+    with pytest.raises(ValueError, match="`halfspace-sss materials list` lists them"):
         sss.materials.load("nonsense")
 
 

@@ -9,7 +9,7 @@ import math
 import pytest
 from typer.testing import CliRunner
 
-from figures.command_line import app
+from figures.app import app
 from halfspace_sss import Medium, trace
 from halfspace_sss.cli.validate import row_filter, summary
 from halfspace_sss.comparison.truths import Comparison, read_truths, trace_order, validate

@@ -14,10 +14,10 @@ import figures
 from figures.computing.images import Shot, absent, compared
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
-from figures.drawing.style import paper, saved
 from figures.parts.part import Part, Result, Task, keys_of
 from figures.parts.runner import compute, draw, duration
 from figures.parts.store import exr_bytes, read_exr
+from halfspace_sss.comparison.style import paper, saved
 
 
 def shade(task: Task) -> dict[str, Any]:

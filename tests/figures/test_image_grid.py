@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from figures.computing.images import Shot, absent, compared, srgb
+from figures.computing.images import Shot, absent, compared
 from figures.drawing.image_grid import Crop, image_grid
-from figures.drawing.style import paper, saved
+from full_geometry.trade.image_differences import srgb
+from halfspace_sss.comparison.style import paper, saved
 
 
 def _scenes() -> dict[str, list[Shot]]:

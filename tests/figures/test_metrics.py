@@ -8,7 +8,7 @@ import flip_evaluator
 import numpy as np
 import pytest
 
-from figures.computing.images import flip_ldr, relative_mse, srgb
+from full_geometry.trade.image_differences import flip_ldr, relative_mse, srgb
 
 METRICS = [flip_ldr, relative_mse]
 

@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from figures.computing.images import Shot, absent, compared, srgb
+from figures.computing.images import Shot, absent, compared
 from figures.drawing.page import page
+from full_geometry.trade.image_differences import srgb
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
 DRIVER = shutil.which("chromedriver")

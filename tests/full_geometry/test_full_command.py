@@ -1,4 +1,4 @@
-"""The commands `train object` and `errors --scene`: files, exit codes, what they refuse, and how they go on."""
+"""The commands `train object` and `errors object`: files, exit codes, what they refuse, and how they go on."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 pytest.importorskip("mitsuba")
 pytest.importorskip("torch")
 
-from figures import command_line as cli  # noqa: E402
+from figures import app as cli  # noqa: E402
 from full_geometry.learning import model_errors, training  # noqa: E402
 from full_geometry.learning import object_learner as command  # noqa: E402
 from full_geometry.learning.network_fitting import Recipe  # noqa: E402
@@ -70,7 +70,7 @@ def test_an_object_is_trained_measured_and_rendered(monkeypatch: Any) -> None:
     traced = []
     monkeypatch.setattr(model_errors, "reference", lambda *a: traced.append(a) or REFERENCE(a[0], 32, 512, *a[3:]))
     chosen = [word for name in ("full_geometry", "better_dipole", "standard_dipole") for word in ("--model", name)]
-    result = _invoke("errors", "--scene", "ball.xml", "--object", "ball", *chosen)
+    result = _invoke("errors", "object", "--scene", "ball.xml", "--object", "ball", *chosen)
     assert result.exit_code == 0, result.output
     table = pandas.read_csv("errors/errors.csv")
     assert list(table.columns) == ["object", "channel", "model", "light", "error", "standard_error", "ratio"]
@@ -124,7 +124,7 @@ def test_a_model_with_single_scattering_is_held_against_walks_with_it(monkeypatc
     fewest = []
     monkeypatch.setattr(model_errors, "reference", lambda *a: fewest.append(a[4]) or REFERENCE(a[0], 8, 64, *a[3:]))
     chosen = ("--model", "directional_dipole", "--model", "better_dipole", "--model", "normalized_diffusion")
-    assert _invoke("errors", "--scene", "ball.xml", *chosen).exit_code == 0
+    assert _invoke("errors", "object", "--scene", "ball.xml", *chosen).exit_code == 0
     assert fewest == [1, 2]
 
 
@@ -132,7 +132,7 @@ def test_as_many_exits_are_traced_as_are_asked_for(monkeypatch: Any) -> None:
     asked = []
     monkeypatch.setattr(model_errors, "reference", lambda *a: asked.append(a[1]) or REFERENCE(a[0], 8, 64, *a[3:]))
     for more in ((), ("--exits", "1024")):
-        assert _invoke("errors", "--scene", "ball.xml", "--model", "better_dipole", *more).exit_code == 0
+        assert _invoke("errors", "object", "--scene", "ball.xml", "--model", "better_dipole", *more).exit_code == 0
     assert asked == [256, 1024]
 
 
@@ -140,7 +140,7 @@ def test_as_many_exits_are_traced_as_are_asked_for(monkeypatch: Any) -> None:
 def test_all_models_that_take_an_object_are_measured_where_none_is_named(monkeypatch: Any) -> None:
     monkeypatch.setattr(model_errors, "reference", lambda *a: REFERENCE(a[0], 8, 64, *a[3:]))
     monkeypatch.setattr(command, "errors_of", functools.partial(command.errors_of, walks=64, samples=64))
-    result = _invoke("errors", "--scene", "ball.xml", "--exits", "8")
+    result = _invoke("errors", "object", "--scene", "ball.xml", "--exits", "8")
     assert result.exit_code == 0, result.output
     measured = set(pandas.read_csv("errors/errors.csv")["model"])
     assert measured >= {"neural", "neural_shape", "better_dipole", "photon_beam_diffusion"}
@@ -206,6 +206,7 @@ def test_a_disk_that_fills_up_leaves_no_half_weights_and_work_to_go_on_from(monk
 
 
 TRAIN_BALL = ("train", "object", "--scene", "ball.xml")
+ERRORS = ("errors", "object", "--scene", "ball.xml")
 REFUSED = [
     (["train", "object", "--scene", "no.xml"], "scene must be an XML file, got 'no.xml'"),
     ([*TRAIN_BALL, "--object", "cube"], "object must be one of ball, got 'cube'"),
@@ -223,16 +224,19 @@ REFUSED = [
     ([*TRAIN_BALL, "--out", "ball.xml"], "folder must be a folder or new, got 'ball.xml'"),
     ([*TRAIN_BALL, "--define", "x"], "define must be NAME=VALUE, got 'x'"),
     ([*TRAIN_BALL, "--base-model", "neural_shap"], "base_model must be one of neural_shape,"),
-    (["errors", "--object", "ball"], "object must be left out without --scene, got 'ball'"),
-    (["errors", "--scene", "ball.xml", "--events", "1e5"], "events must be left out with --scene, got 100000.0"),
-    (["errors", "--scene", "ball.xml", "--model", "no_model"], "model must be one of"),
-    (["errors", "--scene", "ball.xml", "--model", "neural_shap"], "did you mean 'neural_shape'?"),
-    (["errors", "--scene", "ball.xml", "--model", "full_geometry"], "object 'ball' must be trained for full_geometry"),
-    (["errors", "--scene", "ball.xml", "--model", "auto"], "has S for two points of a surface, got 'auto'"),
-    (["errors", "--scene", "ball.xml", "--model", "lambert"], "has S for two points of a surface, got 'lambert'"),
-    (["errors", "--exits", "512"], "exits must be left out without --scene, got 512"),
-    (["errors", "--scene", "ball.xml", "--exits", "1"], "exits must be a whole number >= 2, got 1"),
-    (["errors", "--scene", "ball.xml", "--seed", "-1"], "seed must be a whole number >= 0, got -1"),
+    ([*ERRORS, "--model", "no_model"], "model must be one of"),
+    ([*ERRORS, "--model", "neural_shap"], "did you mean 'neural_shape'?"),
+    (
+        ["errors", "object", "--scene", "ball.xml", "--model", "full_geometry"],
+        "object 'ball' must be trained for full_geometry",
+    ),
+    ([*ERRORS, "--model", "auto"], "has S for two points of a surface, got 'auto'"),
+    (
+        ["errors", "object", "--scene", "ball.xml", "--model", "lambert"],
+        "has S for two points of a surface, got 'lambert'",
+    ),
+    ([*ERRORS, "--exits", "1"], "exits must be a whole number >= 2, got 1"),
+    ([*ERRORS, "--seed", "-1"], "seed must be a whole number >= 0, got -1"),
 ]
 
 

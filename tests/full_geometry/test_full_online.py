@@ -22,8 +22,7 @@ pytest.importorskip("torch")
 import drjit as dr  # noqa: E402
 
 import full_geometry  # noqa: E402
-from figures import command_line as cli  # noqa: E402
-from full_geometry.cli import render as cli_render  # noqa: E402
+from figures import app as cli  # noqa: E402
 from full_geometry.geometry.points import SurfacePoint  # noqa: E402
 from full_geometry.learning import training  # noqa: E402
 from full_geometry.learning.network_fitting import Recipe  # noqa: E402
@@ -62,7 +61,7 @@ def _patch(patch: pytest.MonkeyPatch, folder: Path) -> None:
     patch.setattr(training, "train", lambda *a, **how: TRAIN(*a, **{**how, "recipe": QUICK, "chunks": 4}))
     for name, value in {"CHECKPOINT_EVERY": 0.0, "EXITS": 32, "WALKS": 256, "SAMPLES": 64}.items():
         patch.setattr(training, name, value)
-    patch.setattr(cli_render, "renderer", lambda kind: None)
+    patch.setattr(cli, "drawers", lambda: None)
     patch.setenv(known_weights.ENVIRONMENT_VARIABLE, str(folder / "weights"))
     patch.chdir(folder)
     Path("ball.xml").write_text(XML)

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 dr = pytest.importorskip("drjit")
 mi = pytest.importorskip("mitsuba")
 
-from figures import command_line as cli  # noqa: E402
+from figures import app as cli  # noqa: E402
 from full_geometry.learning import model_errors  # noqa: E402
 from full_geometry.registry import lookup, model_names  # noqa: E402
 from full_geometry.scenes.scene_files import load_scene  # noqa: E402
@@ -109,7 +109,7 @@ def test_the_command_errors_measures_it_beside_a_half_space(tmp_path: Path, monk
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(model_errors, "reference", lambda *a: REFERENCE(a[0], 32, 1024, *a[3:]))
     Path("ball.xml").write_text(XML, encoding="utf-8")
-    words = ["errors", "--scene", "ball.xml", "--model", "neural_shape", "--model", "neural"]
+    words = ["errors", "object", "--scene", "ball.xml", "--model", "neural_shape", "--model", "neural"]
     result = CliRunner().invoke(cli.app, words)
     assert result.exit_code == 0, result.output
     mean = pandas.read_csv("errors/errors.csv").groupby("model")["error"].mean()

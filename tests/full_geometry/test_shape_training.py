@@ -13,7 +13,7 @@ mi = pytest.importorskip("mitsuba")
 pytest.importorskip("igl")
 torch = pytest.importorskip("torch")
 
-from figures import command_line as cli  # noqa: E402
+from figures import app as cli  # noqa: E402
 from figures.modelling.held_out import HELD_OUT  # noqa: E402
 from full_geometry.learning import shape_training as training  # noqa: E402
 from full_geometry.learning.shape_data import (  # noqa: E402  # noqa: E402

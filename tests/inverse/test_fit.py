@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 mi = pytest.importorskip("mitsuba")
 import drjit as dr  # noqa: E402
 
-from figures import command_line as cli  # noqa: E402
+from figures import app as cli  # noqa: E402
 from full_geometry import inverse  # noqa: E402
 from full_geometry.inverse.comparing import ChiSquare, ViewComparison  # noqa: E402
 from full_geometry.inverse.views import GivenView, read_views  # noqa: E402

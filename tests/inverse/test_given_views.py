@@ -13,8 +13,7 @@ from typer.testing import CliRunner
 
 mi = pytest.importorskip("mitsuba")
 
-from figures import command_line as cli  # noqa: E402
-from full_geometry.cli import fit as command  # noqa: E402
+from figures import app as cli  # noqa: E402
 from full_geometry.inverse.views import GivenView, read_views  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("quiet_rgb")
@@ -76,7 +75,7 @@ def test_pixels_below_0_are_told_and_fitted_and_results_are_there_if_the_page_fa
     def broken(*_: Any) -> bytes:
         raise ValueError("no page")
 
-    monkeypatch.setattr(command, "renderer", lambda _: broken)
+    monkeypatch.setattr(cli, "_draw_fit", broken)
     done = CliRunner().invoke(cli.app, [*arguments, "--out", str(tmp_path / "rest")])
     assert done.exit_code == 2 and "no page" in done.output
     assert {path.name for path in (tmp_path / "rest").iterdir()} == names - {"a_fit.html"}

@@ -38,7 +38,7 @@ def test_an_unknown_name_is_answered_with_the_nearest():
 
 
 def test_a_name_like_nothing_points_to_the_list():
-    with pytest.raises(ValueError, match=r"got 'xyzzy'; `halfspace-sss materials` lists them"):
+    with pytest.raises(ValueError, match=r"got 'xyzzy'; `halfspace-sss materials list` lists them"):
         load("xyzzy")
 
 

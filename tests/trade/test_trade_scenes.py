@@ -11,7 +11,7 @@ import pytest
 from render_files import XML
 from typer.testing import CliRunner
 
-from figures import command_line as cli
+from figures import app as cli
 from full_geometry.registry import model_names
 from full_geometry.trade import assess, flat, measuring, recommend, sampling
 from full_geometry.trade.assessing import assess_stage
@@ -324,9 +324,7 @@ def test_lambert_in_a_white_furnace_is_the_diffuse_reflectance_and_what_the_boun
 
 
 def test_the_command_measures_a_scene_and_writes_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from halfspace_sss import extensions
-
-    monkeypatch.setattr(extensions, "renderer", lambda kind: None)  # neither figure nor page
+    monkeypatch.setattr(cli, "drawers", lambda: None)  # neither figure nor page
     file = tmp_path / "ball.xml"
     file.write_text(XML, encoding="utf-8")
     arguments = ["--model", "lambert", "--tolerance", "0.4", "--assess", "0.3", "--out", str(tmp_path / "out")]

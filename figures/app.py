@@ -1,0 +1,128 @@
+"""The commands of `halfspace-sss`: a command is a function with typer annotations and a line in `_commands`.
+
+Packages of others add theirs by an entry point of the group `halfspace_sss.commands`. How commands end is in
+`halfspace_sss.cli.shared`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+import halfspace_sss
+from figures.parts.command import COMMANDS as FIGURES
+from full_geometry.cli.errors import errors_object
+from full_geometry.cli.fit import fit
+from full_geometry.cli.render import render
+from full_geometry.cli.trade import trade
+from full_geometry.cli.train import train_object, train_shapes
+from full_geometry.cli.variants import Drawers
+from halfspace_sss.cli.bench import bench
+from halfspace_sss.cli.curves import curves
+from halfspace_sss.cli.errors import errors_materials, errors_truths
+from halfspace_sss.cli.lists import materials_import, materials_list, materials_show, models
+from halfspace_sss.cli.maps import maps
+from halfspace_sss.cli.shared import Commands, add, group
+from halfspace_sss.cli.train import train_material, train_universal
+from halfspace_sss.cli.validate import validate
+from halfspace_sss.extensions import COMMANDS, FAILURES, commands, warn_left_out
+
+if TYPE_CHECKING:
+    from full_geometry.inverse.comparing import MaterialFit
+    from full_geometry.scenes.picture import Picture
+    from full_geometry.trade.images import TradePicture
+
+GROUPS: Mapping[str, tuple[str, Mapping[str, Callable]]] = {
+    "materials": (
+        "Show the registered materials.",
+        {"list": materials_list, "show": materials_show, "import": materials_import},
+    ),
+    "train": (
+        "Train networks on path tracing: models find them by the medium, and by the shape of an object.",
+        {"material": train_material, "universal": train_universal, "object": train_object, "shapes": train_shapes},
+    ),
+    "errors": (
+        "Measure how wrong models are.",
+        {"materials": errors_materials, "object": errors_object, "truths": errors_truths},
+    ),
+    "figures": ("Compute what changed of the paper's figures, and draw them.", FIGURES),
+}
+SINGLE = {
+    "bench": bench, "curves": curves, "fit": fit, "maps": maps, "models": models,
+    "render": render, "trade": trade, "validate": validate,
+}  # fmt: skip
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"halfspace-sss {halfspace_sss.__version__}")
+        raise typer.Exit()
+
+
+def start(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", callback=_show_version, is_eager=True)] = False,
+) -> None:
+    """Half-space subsurface scattering: compare path tracing and models of the BSSRDF."""
+    context.obj = drawers()
+
+
+def drawers() -> Drawers | None:
+    """What draws results of commands; None where the libraries for it are not installed."""
+    if any(find_spec(name) is None for name in ("PIL", "matplotlib")):
+        return None
+    return Drawers(_draw_render, _draw_fit, _draw_trade)
+
+
+def _draw_render(picture: Picture) -> dict[str, bytes]:
+    from figures.drawing.page import render
+
+    return render(picture)
+
+
+def _draw_fit(found: MaterialFit) -> dict[str, bytes]:
+    from figures.drawing.page import fit
+
+    return {"html": fit(found)}
+
+
+def _draw_trade(picture: TradePicture) -> dict[str, bytes]:
+    from figures.drawing.trade_plot import render
+
+    return render(picture)
+
+
+def make() -> typer.Typer:
+    """All commands, those of other packages too."""
+    app = group("", cls=Commands, completion=True)
+    app.callback()(start)
+    for name, function in SINGLE.items():
+        add(app, name, function)
+    for name, (about, members) in GROUPS.items():
+        inner = group(about)
+        for word, function in members.items():
+            add(inner, word, function)
+        app.add_typer(inner, name=name)
+    for name, function in commands():
+        try:
+            _check_command(name, function)
+        except FAILURES as error:
+            warn_left_out(COMMANDS, name, error)
+        else:
+            add(app, name, function)
+    return app
+
+
+def _check_command(name: str, function: Any) -> None:
+    """Raises, in whichever way typer does, if the function cannot be a command beside the others."""
+    if name in SINGLE or name in GROUPS:
+        raise ValueError(f"name must be new, got {name!r}")
+    alone = typer.Typer()
+    add(alone, name, function)
+    typer.main.get_command(alone)
+
+
+app = make()

@@ -1,0 +1,212 @@
+"""The commands `halfspace-sss errors materials` and `errors truths`: models of the half-space against the truth."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from halfspace_sss.cli import shared
+
+if TYPE_CHECKING:
+    import pandas
+    from rich.table import Table
+
+    from halfspace_sss.physics.medium import Medium
+
+SQUARE = ("error_square", "error_square_standard_error")  # what a printed error is made of
+DEFINITION = (
+    "error: sum |E_model - E_traced| / sum E_traced over unseen pairs of directions, E = ∫ S mu_i mu_o dA over "
+    "blocks of {0} x {0} cells of 40 x 16 from r = 0.02 mfp on; noise of the reference taken out; orders of each model"
+)
+
+
+@dataclass(frozen=True)
+class MediaOptions:
+    """Media without names."""
+
+    registry: Annotated[bool, typer.Option("--registry", help="All registered materials, every channel.")] = False
+    held_out: Annotated[
+        int | None, typer.Option(help="This many random media over the range of `neural`.", parser=shared.whole)
+    ] = None
+    as_trained: Annotated[
+        bool, typer.Option("--as-trained", help="Held-out media as for the training: a third of them with g near 1.")
+    ] = False
+
+
+@dataclass(frozen=True)
+class ReferenceOptions:
+    """What models are compared with."""
+
+    events: Annotated[float, typer.Option(help="Scattering events of the reference for each medium.")] = 2e7
+    block: Annotated[
+        Literal["1", "2", "4", "8"],
+        typer.Option(help="Cells put together for the comparison, in distance and azimuth."),
+    ] = "4"
+    seed: shared.Seed = 0
+    backend: shared.Backend = "llvm"
+
+
+def errors_materials(
+    stated: shared.MediumOptions,
+    many: MediaOptions,
+    traced: ReferenceOptions,
+    places: shared.Places,
+    material: shared.Materials = None,
+    channel: shared.Channels = None,
+    model: shared.Models = None,
+    out: shared.OutFolder = Path("errors"),
+) -> None:
+    """Compare models with path tracing over all directions: error, bias, decades of r; written as CSV and JSON."""
+    from halfspace_sss.backend import array_types
+    from halfspace_sss.checks import check_interval
+    from halfspace_sss.comparison import model_errors
+    from halfspace_sss.provenance import check_folder
+
+    media = _media(stated, material or [], channel, many, traced.seed)
+    block, n = int(traced.block), len(media)
+    check_models(model)
+    check_interval("events", traced.events, 1e4, 1e12)
+    _check_accepted(model or (), list(media.values()))
+    array_types(traced.backend)
+    check_folder(out)
+    with places.executor() as executor, shared.Bar("errors") as bar:
+
+        def show(what: str, done: int, total: int) -> None:
+            bar.show(round(1000 * ((what == "models") + done / total)), 2000, what)
+
+        references = model_errors.references(
+            list(media.values()), traced.events * n, traced.seed, block, show, traced.backend, executor
+        )
+        found = model_errors.error_table(media, references, model or None, show, executor)
+    how = {"events": traced.events, "block": block, "seed": traced.seed}
+    files = write_errors(out, found, model_errors.percentiles(found), DEFINITION.format(block), how)
+    shared.say(*_tables(found, n), DEFINITION.format(block))
+    shared.say_files(files)
+
+
+def errors_truths(model: shared.Models = None, out: shared.OutFolder = Path("errors")) -> None:
+    """Compare reflectances of models with published and exact values: minutes; goes on where it was."""
+    from halfspace_sss.comparison.model_truths import reflectance_truths, truth_summary, truths_cost
+    from halfspace_sss.kept_rows import KeptRows
+    from halfspace_sss.provenance import check_folder, write_atomically
+
+    check_models(model)
+    check_folder(out)
+    kept = KeptRows(out / "truths.part", {"what": "truths"})
+    before, (number, seconds) = len(kept), truths_cost(model or None, kept)
+    note = f", after {before} that were kept" if before else ""
+    shared.tell(f"{number} reflectances, about {max(seconds, 1):.0f} s{note}")
+    with shared.Bar("truths") as bar:
+        found = reflectance_truths(model or None, bar.told, kept)
+    write_atomically(out / "truths.csv", shared.csv_of(found))
+    kept.finish()
+    shared.say(_table(truth_summary(found), "relative error of the reflectance (single order included), %"))
+    shared.say_files([out / "truths.csv"])
+
+
+def _media(
+    stated: shared.MediumOptions, names: list[str], channel: str | None, many: MediaOptions, seed: int
+) -> dict[str, Medium]:
+    """Scalar media by label."""
+    from halfspace_sss import materials
+    from halfspace_sss.checks import check_count
+    from halfspace_sss.comparison.model_errors import held_out_media
+    from halfspace_sss.neural.symmetric import channels
+
+    if many.as_trained and many.held_out is None:
+        raise ValueError("as_trained must come with held_out, got it alone")
+    given = bool(names) or stated != shared.MediumOptions()
+    if given + many.registry + (many.held_out is not None) > 1:
+        raise ValueError("material, registry and held_out must be given one at a time, got several")
+    if many.held_out is not None:
+        check_count("held_out", many.held_out, 1)
+        media = held_out_media(many.held_out, seed, many.as_trained)
+        return {f"a {float(m.albedo):.5g} g {float(m.g):.3g} eta {m.eta:.3g}": m for m in media}
+    results = {}
+    for title, medium in stated.media(materials.names() if many.registry else names, channel).items():
+        labels = () if channel or title == "medium" else materials.load(title).channels
+        for label, one in zip(labels or ("",), channels(medium)):
+            if float(one.albedo) > 0 or not labels:
+                results[f"{title} {label}".strip()] = one
+    return results
+
+
+def check_models(names: Sequence[str] | None) -> None:
+    """ValueError with the nearest name if one is no model of the half-space."""
+    from halfspace_sss import models
+    from halfspace_sss.checks import check_choice
+
+    for name in names or ():
+        check_choice("model", name, models())
+
+
+def _check_accepted(names: Sequence[str], media: list[Medium]) -> None:
+    """Refuse a model, with its own words, that refuses all media."""
+    from halfspace_sss import bssrdf
+
+    for name in names:
+        for k, medium in enumerate(media):
+            try:
+                bssrdf(name, medium)
+                break
+            except ValueError:
+                if k == len(media) - 1:
+                    raise
+
+
+def write_errors(
+    out: Path, found: pandas.DataFrame, summary: pandas.DataFrame, definition: str, how: dict[str, Any]
+) -> list[Path]:
+    """Write errors.csv and errors.json, with what an error is and how it was measured; the paths."""
+    from halfspace_sss.provenance import provenance, write_together
+
+    content = {"provenance": provenance(**how), "definition": definition}
+    content["summary"] = json.loads(summary.to_json(orient="records"))
+    files = {out / "errors.csv": shared.csv_of(found), out / "errors.json": json.dumps(content, indent=1)}
+    write_together(files)
+    return list(files)
+
+
+def _tables(found: pandas.DataFrame, n_media: int) -> list[Table | str]:
+    from halfspace_sss.comparison.model_errors import bands, losses, percentiles
+
+    if n_media <= 3:
+        columns = ["medium", "model", "error", *SQUARE, "noise", "bias", *(c for c in found if c.startswith("r "))]
+        return [_table(found[columns], "errors, %")]
+    results: list[Table | str] = [_table(percentiles(found), "errors over the media, %")]
+    if (found["model"] == "neural").any():
+        results.append(_table(bands(found, "neural"), "neural over ranges of media, %"))
+        lost = losses(found, "neural")[["medium", "error", *SQUARE, "noise", "model_best", "error_best"]]
+        title = f"media on which an analytic model has a smaller error than neural: {len(lost)}"
+        results.append(_table(lost, title) if len(lost) else title)
+    return results
+
+
+def _table(frame: pandas.DataFrame, title: str) -> Table:
+    columns = [name for name in frame if name not in SQUARE]
+    rows = [
+        [told_error(row) if name == "error" and SQUARE[0] in row else _cell(row[name]) for name in columns]
+        for row in frame.to_dict("records")
+    ]
+    left = next((k for k, name in enumerate(columns) if frame[name].dtype.kind != "O"), len(columns))
+    return shared.table([str(name) for name in columns], rows, title=title, left=left)
+
+
+def told_error(row: dict[str, Any]) -> str:
+    """An error with its standard error, or what it is below."""
+    from halfspace_sss.noise_free import NoiseFree
+
+    return NoiseFree(*(row[name] for name in SQUARE)).told()
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, str):
+        return value
+    if isinstance(value, int):
+        return str(value)
+    return "–" if value != value else f"{100 * value:.3g}"
