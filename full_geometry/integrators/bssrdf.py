@@ -76,7 +76,7 @@ def _class(variant: str) -> type:
             self.gathering = Gathering()
             self._lit_entries = LitEntries()
             self._lit: list[TranslucentObject] | None = None  # while an image is rendered
-            self._by_chance = dr.zeros(mi.Float64, 1)
+            self._unconnected = dr.zeros(mi.Float64, 1)
 
         def prepare(self, scene: mi.Scene) -> list[TranslucentObject]:
             """The translucent objects of a scene, made ready once; ValueError if the scene cannot be rendered."""
@@ -114,7 +114,7 @@ def _class(variant: str) -> type:
                     if obj.spectral is not None:
                         obj.spectral.check_covers(obj.geometry.name, sensor)
                 self._lit = self._by_light(scene, objects, sensor, spp)
-                self._by_chance = dr.zeros(mi.Float64, 1)
+                self._unconnected = dr.zeros(mi.Float64, 1)
                 try:
                     sensor.film().prepare([])
                     for launch in launches(sensor, spp):
@@ -168,7 +168,7 @@ def _class(variant: str) -> type:
                 ray = shown(scene, objects, self.settings, ray)
                 parts, hit, chance = trace_paths(scene, objects, self.settings, sampler, ray, active)
                 squares = dr.select(hit & active, mi.Float64(dr.squared_norm(chance)), 0)
-                dr.scatter_add(self._by_chance, squares, mi.UInt32(0))
+                dr.scatter_add(self._unconnected, squares, mi.UInt32(0))
             return parts[0] + parts[1], hit | mi.Bool(shows_sky(scene, self.settings.hide_emitters)), []
 
         @property
@@ -177,9 +177,9 @@ def _class(variant: str) -> type:
             return self._objects.choices
 
         @property
-        def by_chance(self) -> float:
+        def unconnected(self) -> float:
             """Of light that orders below two met by chance, squares summed over channels and samples of an image."""
-            return float(self._by_chance[0])
+            return float(self._unconnected[0])
 
         @property
         def gathered(self) -> list[str]:

@@ -24,7 +24,7 @@ from full_geometry.geometry.points import cosine_above, opaque, place
 from full_geometry.geometry.rounding import blocked, ray_from
 from full_geometry.geometry.snapshot import Snapshot, same_objects
 from full_geometry.integrators.inner_light import COUNT, inner_light
-from full_geometry.integrators.lighting import Lights, Sky, mis_weight
+from full_geometry.integrators.lighting import EnvironmentMean, Lights
 from full_geometry.integrators.surface_paths import trace_paths
 from full_geometry.precomputed.inner import Events, InnerLight, has_inner_light
 from full_geometry.precomputed.point_pairs import Rays
@@ -39,6 +39,7 @@ from full_geometry.precomputed.transfer import (
     transfer,
 )
 from full_geometry.sampling.light_points import GOLDEN, SurfacePoints
+from full_geometry.walk.emission import emitter_pdf, mis_weight, sample_emitter
 from halfspace_sss.backend import clock
 
 if TYPE_CHECKING:
@@ -68,7 +69,7 @@ class Gathered:
         transfer: of the model.
         light: that arrives, less c.
         parts: independent estimates of it.
-        c: mean radiance of the sky in the channels where alpha is known, else 0, see `lighting.Sky`.
+        c: mean radiance of the sky in the channels where alpha is known, else 0, see `lighting.EnvironmentMean`.
     """
 
     object: TranslucentObject
@@ -234,7 +235,7 @@ def _leaving(
     if events is not None:
         seen = mi.Float(np.mean(others, axis=0).astype(np.float32).ravel())
         inner = inner_light(scene, objects, k, settings, events, (T.points, seen))
-    sky = Sky.of(scene, Lights.of(scene), [obj])
+    sky = EnvironmentMean.of(scene, Lights.of(scene), [obj])
     c = np.zeros(len(T.trusted)) if sky is None else T.trusted * np.ravel(np.array(sky.mean))
     lights = tuple(replace(light, mean=light.mean - c.astype(np.float32)) for light in lights)
     light = Incident.mean_of(lights)
@@ -372,7 +373,7 @@ def by_emitters(
 ) -> tuple[mi.Spectrum, mi.Vector3f]:
     """Light of sampled emitters less c of the sky, and its direction."""
     here = place(at.p, at.n)
-    ds, light = scene.sample_emitter_direction(here, u, False)
+    ds, light = sample_emitter(scene, here, u, mi.Bool(True))
     a, pdf = _weight(albedo, at, ds.d)
     above = (ds.pdf > 0) & (pdf > 0)
     light = dr.select(blocked(scene, instance_scene.ray_to_emitter(here, ds, at.e), above), 0, light)
@@ -412,7 +413,7 @@ def met_by_cosine(
     si = instance_scene.intersect(scene, ray, mi.RayFlags.All, True)
     emitter = si.emitter(scene)
     shines = emitter != None  # noqa: E711
-    density = scene.pdf_emitter_direction(here, mi.DirectionSample3f(scene, si, here), shines)
+    density, _ = emitter_pdf(scene, here, si, shines)
     L = emitter.eval(si, shines) - dr.select(emitter.is_environment(), c, 0)
     met = dr.select(shines, mis_weight(pdf, density) * L, 0)
     return a * met, a, w, ray, si

@@ -16,8 +16,8 @@ import numpy as np
 
 from full_geometry.geometry.points import opaque, place, wrapped
 from full_geometry.geometry.rounding import ray_from
+from full_geometry.integrators.ballistic_and_single import light_at_events
 from full_geometry.integrators.lighting import Primal, RenderContext
-from full_geometry.integrators.low_orders import light_at_events
 from full_geometry.precomputed.inner import Events, InnerLight, bands
 from full_geometry.precomputed.transfer import R_2
 
@@ -58,7 +58,7 @@ def inner_light(
     u, u_emitter = (mi.Point2f(*(wrapped(x + opaque(t)) for x, t in zip(steps, part))) for part in np.split(turn, 2))
     d, inverse_pdf = _directions(sky, at, float(obj.media[0].eta), u)
     found = light_at_events(context, obj, at, (d, inverse_pdf), u_emitter, sampler)
-    met = found.chance + found.weight * _beyond(context, obj, found.left, others)
+    met = found.unconnected + found.weight * _beyond(context, obj, found.left, others)
     largest = bands(obj)
 
     # ---- Σ over ways of Y_lm times light

@@ -1,9 +1,8 @@
-"""What every path needs to know of a scene: its emitters, the mean radiance of its sky, its objects; and its tally.
+"""What every path of `bssrdf` needs to know: emitters, the mean of the environment, objects; and its radiance.
 
-A tally is the radiance of a path, or in a replay the derivatives of its radiance. Derivatives follow path replay
-backpropagation (Vicini, Speierer and Jakob 2021). A path is traced, then traced again with the same random numbers. At
-every vertex of the replay the radiance still to come is known. Each factor is then differentiated on its own with the
-others held, and no loop is recorded. Directions and densities are held too.
+Derivatives follow path replay backpropagation (PRB; Vicini, Speierer and Jakob 2021). A path is traced, then traced
+again with the same random numbers. At every vertex of the replay the radiance still to come is known. Each factor is
+then differentiated on its own with the others held, and no loop is recorded. Directions and densities are held too.
 """
 
 from __future__ import annotations
@@ -17,19 +16,21 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.geometry.instances import InstanceScene, InstanceTransform
-from full_geometry.geometry.rounding import blocked
 from full_geometry.objects.objects import TranslucentObject
 from full_geometry.objects.small_emitters import WIDE, SmallEmitters, is_delta
 from full_geometry.settings import AUTOMATIC, Settings
+from full_geometry.walk.random_walk import below
 
 
 @dataclass
-class PathTally:
-    """What the paths of a launch sum up."""
+class PathRadiance:
+    """Radiance of a path, or in a replay what is still to come of it and the derivatives."""
 
     L: mi.Spectrum  # primal: radiance so far; replay: radiance still to come
     derivative: mi.Spectrum | tuple[()]  # replay forward: derivative of L; backward: adjoint of L; primal: nothing
-    chance: mi.Spectrum  # primal: of L, light that orders below two have met by chance
+    unconnected: (
+        mi.Spectrum
+    )  # primal: of L, light of orders 0 and 1 that phase sampling has hit and no connection finds
 
 
 @dataclass(frozen=True)
@@ -38,26 +39,32 @@ class Primal:
 
     tracks = False
 
-    def add(self, tally: PathTally, light: mi.Spectrum) -> PathTally:
+    def add(self, radiance: PathRadiance, light: mi.Spectrum) -> PathRadiance:
         """Add the light of one estimator of the path."""
-        return replace(tally, L=tally.L + light)
+        return replace(radiance, L=radiance.L + light)
 
-    def note_chance(self, tally: PathTally, light: mi.Spectrum) -> PathTally:
-        """Note light, which is in the tally already, as met by chance."""
-        return replace(tally, chance=tally.chance + light)
+    def add_unconnected(self, radiance: PathRadiance, light: mi.Spectrum) -> PathRadiance:
+        """Note light, which is in L already, as hit by phase sampling alone."""
+        return replace(radiance, unconnected=radiance.unconnected + light)
 
-    def settle(
-        self, tally: PathTally, light: mi.Spectrum, weight: mi.Spectrum, continues: mi.Bool, shown: mi.Spectrum | float
-    ) -> PathTally:
+    def update(
+        self,
+        radiance: PathRadiance,
+        light: mi.Spectrum,
+        weight: mi.Spectrum,
+        continues: mi.Bool,
+        shown: mi.Spectrum | float,
+    ) -> PathRadiance:
         """Add the light of a vertex.
 
         Args:
-            light: light of next-event estimation at the vertex.
+            radiance: so far.
+            light: of next-event estimation at the vertex.
             weight: factor of the throughput at the vertex.
             continues: whether the path goes on with that weight.
-            shown: light per weight that has the weight too and is in the tally already.
+            shown: light per weight that has the weight too and is in L already.
         """
-        return self.add(tally, light)
+        return self.add(radiance, light)
 
 
 @dataclass(frozen=True)
@@ -71,43 +78,44 @@ class Replay:
     backward: bool
     tracks = True
 
-    def add(self, tally: PathTally, light: mi.Spectrum) -> PathTally:
+    def add(self, radiance: PathRadiance, light: mi.Spectrum) -> PathRadiance:
         """Take the light of one estimator away, and differentiate it."""
-        tally = self._differentiate(tally, light)
-        return replace(tally, L=tally.L - dr.detach(light))
+        radiance = self._differentiate(radiance, light)
+        return replace(radiance, L=radiance.L - dr.detach(light))
 
-    def note_chance(self, tally: PathTally, light: mi.Spectrum) -> PathTally:
-        """Nothing: what is met by chance is known from the first pass."""
-        return tally
+    def add_unconnected(self, radiance: PathRadiance, light: mi.Spectrum) -> PathRadiance:
+        """Nothing: the first pass has noted it."""
+        return radiance
 
-    def settle(
-        self, tally: PathTally, light: mi.Spectrum, weight: mi.Spectrum, continues: mi.Bool, shown: mi.Spectrum | float
-    ) -> PathTally:
-        """As of `Primal`; d(light + weight L_next) with L_next = (L - light) / weight held."""
-        L = tally.L - dr.detach(light)
+    def update(
+        self,
+        radiance: PathRadiance,
+        light: mi.Spectrum,
+        weight: mi.Spectrum,
+        continues: mi.Bool,
+        shown: mi.Spectrum | float,
+    ) -> PathRadiance:
+        """The PRB update: d(light + weight L_next) with L_next = (L - light) / weight held; as of `Primal`."""
+        # L without the light of this vertex, and per weight: what comes from the vertices behind
+        L = radiance.L - dr.detach(light)
         fixed = dr.detach(weight)
         L_next = dr.select(continues & (fixed != 0), L / dr.select(fixed != 0, fixed, 1), 0)
-        return self._differentiate(replace(tally, L=L), light + weight * (L_next + shown))
+        return self._differentiate(replace(radiance, L=L), light + weight * (L_next + shown))
 
-    def _differentiate(self, tally: PathTally, value: mi.Spectrum) -> PathTally:
+    def _differentiate(self, radiance: PathRadiance, value: mi.Spectrum) -> PathRadiance:
         if not dr.grad_enabled(value):
-            return tally
+            return radiance
+        # backward: the adjoint of L times d value goes to the parameters; forward: d value to the derivative of L
         if self.backward:
-            dr.backward_from(tally.derivative * value)
-            return tally
-        return replace(tally, derivative=tally.derivative + dr.forward_to(value))
+            dr.backward_from(radiance.derivative * value)
+            return radiance
+        return replace(radiance, derivative=radiance.derivative + dr.forward_to(value))
 
 
 NEE_SHARE = 0.5
-SKY_DIRECTIONS = 128  # squared
-DIM_ALONE, DIM = 0.1, 1.0  # of the mean radiance of the sky, expected of surfaces before it
-MOST_LEFT = 0.5  # of the mean square of the radiance of the sky, once its mean is taken away
-
-
-def mis_weight(pdf: mi.Float, other: mi.Float) -> mi.Float:
-    """MIS weight of a sample of density `pdf` against a strategy of density `other`, by the balance heuristic."""
-    total = pdf + other
-    return dr.select(total > 0, pdf / dr.maximum(total, 1e-30), 0)
+MEAN_DIRECTIONS = 128  # squared
+DIM_ALONE, DIM = 0.1, 1.0  # of the mean radiance of the environment, expected of surfaces before it
+MOST_LEFT = 0.5  # of the mean square of the radiance of the environment, once its mean is taken away
 
 
 @dataclass(frozen=True)
@@ -120,19 +128,19 @@ class Lights:
         some_local: whether there is an emitter beside the environment.
         some_shaped: whether there is one with a shape, which rays can hit.
         some_delta: whether there is one that no ray can hit (point, spot, directional).
-        sky_alone: whether the environment is the only one, and varies.
+        environment_alone: whether the environment is the only one, and varies.
     """
 
     nee_share: float
     some_local: bool
     some_shaped: bool
     some_delta: bool
-    sky_alone: bool
+    environment_alone: bool
 
     @property
     def entry_share(self) -> float:
         """`nee_share` of entries, where such directions are apart from those that may meet anything."""
-        return 0.0 if self.sky_alone else self.nee_share
+        return 0.0 if self.environment_alone else self.nee_share
 
     @classmethod
     def of(cls, scene: mi.Scene) -> Lights:
@@ -145,8 +153,8 @@ class Lights:
         return cls(0.0 if even else NEE_SHARE, local, shaped, delta, not even and not local)
 
 
-class Sky(NamedTuple):
-    """The environment of a scene with its mean radiance c, a control variate for transports of known albedo.
+class EnvironmentMean(NamedTuple):
+    """Mean radiance c of the environment of a scene, a control variate for transports of known directional albedo.
 
     With the directional albedo alpha = ∫ S mu_i dw_i dA_i of a point of an object
 
@@ -159,8 +167,8 @@ class Sky(NamedTuple):
     mean: mi.Spectrum  # c
 
     @classmethod
-    def of(cls, scene: mi.Scene, lights: Lights, objects: list[TranslucentObject]) -> Sky | None:
-        """The sky of a scene; None without one, without an object that has `alpha`, or where c is of little use.
+    def of(cls, scene: mi.Scene, lights: Lights, objects: list[TranslucentObject]) -> EnvironmentMean | None:
+        """c of a scene; None without an environment, without an object that has `alpha`, or where c is of little use.
 
         c is left out where it is not most of the light in the square, as under a sun: it costs time there and takes
         no noise away.
@@ -169,14 +177,17 @@ class Sky(NamedTuple):
         if emitter is None or all(obj.alpha is None for obj in objects):
             return None
         with dr.suspend_grad():
-            k = dr.arange(mi.UInt32, SKY_DIRECTIONS**2)
-            u = mi.Point2f(k % SKY_DIRECTIONS + 0.5, k // SKY_DIRECTIONS + 0.5) / SKY_DIRECTIONS
-            si = dr.zeros(mi.SurfaceInteraction3f, SKY_DIRECTIONS**2)
+            # radiance along a grid of directions of uniform density
+            k = dr.arange(mi.UInt32, MEAN_DIRECTIONS**2)
+            u = mi.Point2f(k % MEAN_DIRECTIONS + 0.5, k // MEAN_DIRECTIONS + 0.5) / MEAN_DIRECTIONS
+            si = dr.zeros(mi.SurfaceInteraction3f, MEAN_DIRECTIONS**2)
             si.wi = -mi.warp.square_to_uniform_sphere(u)
+            # density by which paths draw them: (1 - share) / 4 pi + share p_e
             pdf = (1 - lights.nee_share) * mi.warp.square_to_uniform_sphere_pdf(si.wi)
             if lights.nee_share > 0:
                 pdf += lights.nee_share * scene.pdf_emitter_direction(si, _towards(emitter, -si.wi))
             L, weight = np.array(mi.Spectrum(emitter.eval(si)) + 0 * pdf), 1 / np.array(pdf)
+            # c = Σ L / pdf / Σ 1 / pdf; it serves where E[(L - c)²] is much less than E[L²]
             c = np.average(L, axis=1, weights=weight)
             left = np.average((L - c[:, None]) ** 2, axis=1, weights=weight).sum()
             if left > MOST_LEFT * np.average(L**2, axis=1, weights=weight).sum():
@@ -201,7 +212,7 @@ class RenderContext:
         objects: its translucent objects.
         settings: those of the integrator.
         mode: whether paths are traced or replayed.
-        sky: its mean radiance, where that serves.
+        environment_mean: mean radiance of its environment, where that serves as a control variate.
         small: its emitters that look small, if there are any.
     """
 
@@ -210,7 +221,7 @@ class RenderContext:
     objects: list[TranslucentObject]
     settings: Settings
     mode: Primal | Replay
-    sky: Sky | None = None
+    environment_mean: EnvironmentMean | None = None
     small: SmallEmitters | None = None
 
     @classmethod
@@ -221,7 +232,7 @@ class RenderContext:
         lights = Lights.of(scene)
         with dr.suspend_grad():
             small = SmallEmitters.of(scene)
-        return cls(scene, lights, objects, settings, mode, Sky.of(scene, lights, objects), small)
+        return cls(scene, lights, objects, settings, mode, EnvironmentMean.of(scene, lights, objects), small)
 
     @cached_property
     def instance_scene(self) -> InstanceScene:
@@ -241,70 +252,52 @@ class RenderContext:
         """Whether the environment has suns, which are sampled like small emitters."""
         return self.small is not None and len(self.small.suns) > 0
 
-    def uses_sky(self, obj: TranslucentObject) -> bool:
-        """Whether the mean radiance of the sky is a control variate for an object."""
-        return self.sky is not None and obj.alpha is not None
+    def uses_environment_mean(self, obj: TranslucentObject) -> bool:
+        """Whether the mean radiance of the environment is a control variate for an object."""
+        return self.environment_mean is not None and obj.alpha is not None
 
-    def sky_means(self, obj: TranslucentObject) -> tuple[mi.Spectrum, mi.Spectrum]:
-        """c in the channels where alpha is known, else 0: for orders below two and for the others."""
-        low_orders, others = obj.alpha.known
-        return low_orders * self.sky.mean, others * self.sky.mean
+    def environment_means(self, obj: TranslucentObject) -> tuple[mi.Spectrum, mi.Spectrum]:
+        """c in the channels where alpha is known, else 0: for orders 0 and 1 and for the others."""
+        once, others = obj.alpha.known
+        return once * self.environment_mean.mean, others * self.environment_mean.mean
 
     def entries(self, obj: TranslucentObject) -> int:
         """Candidates of resampling for an exit: one where c is nearly all light and the settings leave it open."""
-        alone = self.uses_sky(obj) and not self.lights.some_local
+        alone = self.uses_environment_mean(obj) and not self.lights.some_local
         return 1 if alone and self.settings.entries == AUTOMATIC else obj.entries
 
     @property
     def dim(self) -> float:
-        """Radiance that is expected of surfaces before the sky, over its own: less where an object has itself alone."""
+        """Radiance expected of surfaces before the environment, over its own: less where an object has itself alone."""
         return DIM_ALONE if len(self.scene.shapes()) == 1 else DIM
 
-    def sample_sky(
+    def sample_environment(
         self, at: mi.Interaction3f, u: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.Vector3f, mi.Float, mi.Spectrum]:
-        """A direction of the sky, the only emitter, its density, 1/sr, and the radiance from there."""
+        """A direction of the environment, the only emitter, its density, 1/sr, and the radiance from there."""
         ds, light = self.scene.sample_emitter_direction(at, u, False, active)
         return ds.d, ds.pdf, light * ds.pdf
 
-    def pdf_sky(self, at: mi.Interaction3f, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        """Density of emitter sampling for a direction of the sky, 1/sr."""
+    def pdf_environment(self, at: mi.Interaction3f, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
+        """Density of emitter sampling for a direction of the environment, 1/sr."""
         return self.scene.pdf_emitter_direction(at, _towards(self.scene.environment(), d), active)
 
-    def eval_sky(self, at: mi.Interaction3f, d: mi.Vector3f, active: mi.Bool) -> tuple[mi.Float, mi.Spectrum]:
-        """The density of a direction by `sample_sky`, and the radiance from there."""
+    def eval_environment(self, at: mi.Interaction3f, d: mi.Vector3f, active: mi.Bool) -> tuple[mi.Float, mi.Spectrum]:
+        """Density of a direction by `sample_environment`, and the radiance from there."""
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.wi, si.wavelengths = -d, at.wavelengths
-        return self.pdf_sky(at, d, active), self.scene.environment().eval(si, active)
+        return self.pdf_environment(at, d, active), self.scene.environment().eval(si, active)
 
-    def connects_sky(self, obj: TranslucentObject) -> bool:
-        """Whether scattering events are connected with the sky: where it varies and c does not take its noise away."""
-        return self.scene.environment() is not None and self.lights.nee_share > 0 and not self.uses_sky(obj)
+    def connects_environment(self, obj: TranslucentObject) -> bool:
+        """Whether events are connected with the environment: where it varies and c does not take its noise away."""
+        return (
+            self.scene.environment() is not None and self.lights.nee_share > 0 and not self.uses_environment_mean(obj)
+        )
 
     def sampled_by_nee(self, emitter: mi.EmitterPtr, d: mi.Vector3f) -> mi.Bool:
-        """Whether emitter connections find an emitter in the direction d: any but a sky without a sun there."""
+        """Whether emitter connections find an emitter in the direction d: all but an environment without a sun."""
         local = ~emitter.is_environment()
         return local | (self.small.index_of(emitter, d) >= 0) if self.suns else local
-
-
-def sample_emitter(
-    context: RenderContext, ref: mi.Interaction3f, u: mi.Point2f, seen: bool, active: mi.Bool
-) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
-    """A direction of next-event estimation, and light over its density; derivatives are those of the light.
-
-    With `seen` of what `ref`, a surface that a ray has met, sees: the density and the light are 0 where it does not.
-    """
-    with dr.suspend_grad():
-        ds, light = context.scene.sample_emitter_direction(ref, u, False, active)
-        if seen:
-            shadow = context.instance_scene.ray_to_emitter(ref, ds, context.instance_scene.rounding(ref))
-            hidden = blocked(context.scene, shadow, active & (ds.pdf > 0))
-            ds.pdf, light = dr.select(hidden, 0, ds.pdf), dr.select(hidden, 0, light)
-        inverse = dr.select(ds.pdf > 0, dr.rcp(ds.pdf), 0)
-    if not context.mode.tracks:
-        return ds, light
-    shines = active & (ds.pdf > 0)
-    return ds, dr.replace_grad(light, context.scene.eval_emitter_direction(ref, ds, shines) * inverse)
 
 
 def delta_light(
@@ -312,5 +305,5 @@ def delta_light(
 ) -> tuple[mi.UInt32, mi.Spectrum]:
     """One of the delta lights, and its light along a ray, spread over a wide cone, over its probability."""
     n = context.small.n_delta
-    which = mi.UInt32(dr.minimum(sampler.next_1d() * n, n - 1)) if n > 1 else mi.UInt32(0)
+    which = below(n, sampler.next_1d()) if n > 1 else mi.UInt32(0)
     return which, n * context.small.spread(which, ray, mi.Float(WIDE), active)

@@ -107,7 +107,7 @@ def _brought(context: RenderContext, obj: TranslucentObject, count: int) -> tupl
     entry = uniform_entries(obj.geometry, sampler.next_1d(), sampler.next_2d())
     at = GatheringPoint(entry.p, entry.n, entry.n_out, obj.geometry.clearance)
     albedo = Albedo(np.tile([1.0, 0.0, 0.0], (len(obj.media), 1)), float(obj.media[0].eta))
-    c = context.sky_means(obj)[1] if context.uses_sky(obj) else mi.Spectrum(0)
+    c = context.environment_means(obj)[1] if context.uses_environment_mean(obj) else mi.Spectrum(0)
     aimed, _ = by_emitters(context.scene, context.instance_scene, albedo, at, sampler.next_2d(), c)
     met = met_by_cosine(context.scene, context.instance_scene, albedo, at, sampler.next_2d(), c)[0]
     square, face = dr.mean(aimed * aimed + met * met) + dr.zeros(mi.Float, count), entry.face

@@ -2,7 +2,7 @@
 
 One symbolic loop whose lanes begin a new path when one ends. A step is a segment inside an object (`random_walk`) or a
 ray outside with the surface that it meets. Emission is weighted against next-event estimation at the previous vertex
-(power heuristic) and against the strategies of `emitter_connections`. Delta lights, which no ray meets, are spread over
+and against the strategies of `emitter_connections`. Delta lights, which no ray meets, are spread over
 a cone where a path leaves a vertex that next-event estimation could not light (`objects.small_emitters`). Boundaries of
 index 1 are no vertices (`straight_light`).
 """
@@ -16,10 +16,11 @@ import drjit as dr
 import mitsuba as mi
 
 from full_geometry.geometry.points import lifted, opaque, sided
-from full_geometry.geometry.rounding import blocked, ray_from
+from full_geometry.geometry.rounding import ray_from
 from full_geometry.geometry.sensors import past_emitters, shows_sky
 from full_geometry.objects.small_emitters import NARROW, WIDE, SmallEmitters
 from full_geometry.precomputed.unscattered_light import UnscatteredLight
+from full_geometry.walk.emission import emission, emitter_pdf, mis_weight, next_event, survival
 from full_geometry.walk.emitter_connections import (
     Departure,
     EmitterDirections,
@@ -34,6 +35,7 @@ from full_geometry.walk.random_walk import (
     Visitor,
     Walk,
     Walker,
+    below,
     draw,
     eval_phase,
     sample_bsdf,
@@ -204,24 +206,27 @@ class LightVisitor:
 
     def met_emitter(self, walk: Walk, record: LightRecord, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
         """Light of an emitter that the ray meets, weighted against sampling it from the last vertex."""
+        # p_e of next-event estimation at the last vertex; 0 where that had but one direction
         emitter = si.emitter(self.scene)
         active = active & (emitter != None) & ~record.precomputed  # noqa: E711
-        previous = dr.zeros(mi.Interaction3f)
-        previous.p = record.previous
-        ds = mi.DirectionSample3f(self.scene, si, previous)
-        sampled = active & ~record.delta
-        pdf = dr.select(sampled, self.scene.pdf_emitter_direction(previous, ds, sampled), 0)
+        previous, sampled = interaction_of(record.previous, walk.medium), active & ~record.delta
+        pdf, ds = emitter_pdf(self.scene, previous, si, sampled)
+        pdf = dr.select(sampled, pdf, 0)
+
+        # p_e of `straight_light` at the last event, where nothing has refracted since
         if self.straight_light is not None:
             sighted = sampled & record.sighted
             pdf = dr.select(sighted, self.straight_light.pdf_emitter(previous, ds, sighted), pdf)
-        share = dr.select(record.delta, 1, power_heuristic(record.pdf, pdf))
+        weight = dr.select(record.delta, 1, mis_weight(record.pdf, pdf))
+
+        # what connections find does not count; directions to emitters have weights of their own
         if self.connections is not None and self.small.some_met:
             which = self.small.index_of(emitter, walk.d)
             active &= ~(record.connected & self.connections.covers(which, si.p, walk.d, record.pivot))
             directed = active & record.directed
-            state = (which, record.departure, walk.medium, share, directed)
-            _, _, _, share, _ = dr.if_stmt(state, directed, self._against_directions, lambda *state: state)
-        return dr.select(active, walk.weight * emitter.eval(si, active) * share, 0)
+            state = (which, record.departure, walk.medium, weight, directed)
+            _, _, _, weight, _ = dr.if_stmt(state, directed, self._against_directions, lambda *state: state)
+        return walk.weight * emission(emitter, si, weight, active)
 
     def mirrored_emitter(
         self, walk: Walk, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool
@@ -283,19 +288,8 @@ class LightVisitor:
         outwards: mi.Bool | bool = True,
     ) -> mi.Spectrum:
         """Light of a sampled emitter by the surface at `si`; by a boundary only from its outer side."""
-        rng = walk.rng
-        u = mi.Point2f(rng.next_float32(), rng.next_float32())
-        active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        ds, light = self.scene.sample_emitter_direction(si, u, False, active)
-        active &= (ds.pdf > 0) & (~mi.Bool(outwards) | (dr.dot(ds.d, si.n) > 0))
-        shadow = self.media.instance_scene.ray_to_emitter(si, ds, self.media.instance_scene.rounding(si))
-        active &= ~blocked(self.scene, shadow, active)
-        wo = si.to_local(ds.d)
-        below = outwards & (wo.z < 0)  # comes from inside by the opposite direction, and is not mirrored
-        active &= ~below | (mi.Frame3f.cos_theta(si.wi) < 0)
-        value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, dr.select(below, -wo, wo), active)
-        share = dr.select(ds.delta, 1, power_heuristic(ds.pdf, pdf))
-        return dr.select(active, walk.weight * value * light * share, 0)
+        u = mi.Point2f(walk.rng.next_float32(), walk.rng.next_float32())
+        return walk.weight * next_event(self.scene, self.media.instance_scene, (si, bsdf), u, active, outwards)
 
 
 def _same_state(*state: Any) -> tuple:
@@ -323,12 +317,6 @@ def start_record(lanes: int, scored: bool = False) -> LightRecord:
         sighted=full(mi.Bool, False), scattered=full(mi.Bool, False),
         precomputed=full(mi.Bool, False), slopes=Score.sums(lanes) if scored else (),
     )  # fmt: skip
-
-
-def power_heuristic(a: mi.Float, b: mi.Float) -> mi.Float:
-    """Weight of a sample of density a against another of density b: a² / (a² + b²)."""
-    share = dr.square(a) / (dr.square(a) + dr.square(b))
-    return dr.select(dr.isfinite(share), share, 0)
 
 
 # ---- The loop --------------------------------------------------------------------------------------------------------
@@ -423,10 +411,10 @@ class PathTracer:
         # ---- emission, with its MIS weight
         first = p.depth == 0
         shown = ~first if self.hide_emitters else mi.Bool(True)
-        emission = self.visitor.met_emitter(p.walk, p.light, si, shown)
+        L_e = self.visitor.met_emitter(p.walk, p.light, si, shown)
         if self.layers:
-            p = replace(p, emission=p.emission + dr.select(first, emission, 0))
-        L = p.light.L + emission
+            p = replace(p, emission=p.emission + dr.select(first, L_e, 0))
+        L = p.light.L + L_e
         L = L + self.visitor.spread_lights(p.walk, p.light, p.walk.alive)
         light = replace(p.light, L=L, connected=mi.Bool(False), directed=mi.Bool(False), precomputed=mi.Bool(False))
 
@@ -469,14 +457,14 @@ class PathTracer:
 
         # ---- Russian roulette
         size = dr.max(weight) * scale
-        survive = dr.select(p.depth >= self.rr_depth, dr.minimum(size, 0.95), 1)
+        survive = survival(size, p.depth, self.rr_depth)
         weight = weight / dr.maximum(survive, 1e-30)
         alive = (bs.pdf > 0) & (size > 0) & (rng.next_float32() < survive) & ~(mute & ~enters)
 
         # ---- the way on, or into an object
         u, channel = rng.next_float32(), walk.channel
         if len(weight) > 1:  # drawn once in a path, whose densities are counted from there
-            channel = dr.select(p.depth == 1, _channel(u, len(weight)), channel)
+            channel = dr.select(p.depth == 1, below(len(weight), u), channel)
         if media.inner is not None:  # from glass inside an object
             returns = encloses & (dr.dot(d, si.n) > 0)
             k, enters = dr.select(returns, around, k), enters | returns
@@ -513,14 +501,10 @@ class PathTracer:
         if self.visitor.unscattered is None:
             return mi.Bool(False), L, p
         mirrors = active & ~media.row("rough", k)
-        emission = self.visitor.mirrored_emitter(p.walk, si, bsdf, mirrors)
+        L_e = self.visitor.mirrored_emitter(p.walk, si, bsdf, mirrors)
         if self.layers:
-            p = replace(p, emission=p.emission + dr.select(p.depth == 1, emission, 0))
-        return mirrors, L + emission, p
-
-
-def _channel(u: mi.Float, n: int) -> mi.UInt32:
-    return dr.minimum(mi.UInt32(u * n), n - 1)
+            p = replace(p, emission=p.emission + dr.select(p.depth == 1, L_e, 0))
+        return mirrors, L + L_e, p
 
 
 def _same(p: CameraPath) -> CameraPath:

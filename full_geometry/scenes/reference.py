@@ -186,7 +186,7 @@ def _pass(reference: Reference | None, scene: Any, integrator: Any, sensor: int,
     result = start.add(image, spp, time.perf_counter() - started)
     if not is_bssrdf(integrator) or mi.is_spectral:
         return result
-    squares = float(f"{start.about.get(BY_CHANCE, 0.0) + integrator.by_chance:.6g}")
+    squares = float(f"{start.about.get(BY_CHANCE, 0.0) + integrator.unconnected:.6g}")
     return replace(result, about={**result.about, BY_CHANCE: squares})
 
 

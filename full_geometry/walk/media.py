@@ -28,6 +28,7 @@ from full_geometry.objects.small_emitters import is_delta
 from full_geometry.surface.translucent import MediumSpec, is_rough, is_smooth_boundary, smooth_boundary
 from full_geometry.surface.varying import VaryingMedium, eval_volume
 from full_geometry.surface.wrapped import Wrapping, surface_of, wrapping_of
+from full_geometry.walk.emission import unmasked_surface
 from halfspace_sss.physics.medium import Medium
 
 # ---- Shapes, media and lights inside objects ------------------------------------------------------------------------
@@ -600,8 +601,7 @@ class WalkMedia:
         for number, around in enumerate(self.wrappings):
             if around.mixes:
                 here, obj = self.has_shape(k, number), self.objects[number]
-                behind = (dr.dot(si.n, d) * obj.side(si.prim_index, here) > 0) & obj.closed
-                drawn = around.draw(si, behind, rng.next_float32(), here)
+                drawn = unmasked_surface(around, obj, si, d, rng.next_float32(), here)
                 bsdf = dr.select(here, drawn, bsdf)
                 k = dr.select(here & (drawn != mi.BSDFPtr(around.surface)), -1, k)
         return k, bsdf

@@ -357,9 +357,14 @@ def sample_bsdf(
     return bsdf.sample(ctx or mi.BSDFContext(), si, u, v)
 
 
+def below(n: int, u: mi.Float) -> mi.UInt32:
+    """One of the whole numbers 0 ... n - 1, for a uniform number."""
+    return dr.minimum(mi.UInt32(u * n), n - 1)
+
+
 def draw(n: int, rng: mi.PCG32) -> mi.UInt32:
-    """A whole number below n."""
-    return dr.minimum(mi.UInt32(rng.next_float32() * n), n - 1)
+    """A random whole number below n."""
+    return below(n, rng.next_float32())
 
 
 # ---- Walks from given points ----------------------------------------------------------------------------------------

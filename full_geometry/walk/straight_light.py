@@ -1,7 +1,7 @@
 """Light of emitters that reaches events straight, through boundaries of relative index 1.
 
 A boundary without refraction hides no emitter. Each event samples one of the emitters and weights it against the
-direction that the phase function draws (power heuristic), as volume path tracers do through boundaries that are `null`.
+direction that the phase function draws, as volume path tracers do through boundaries that are `null`.
 On its way out light may leave the object and pass it again. Both strategies know the same ways: the object of the
 event, and nothing else, lies between the event and the emitter, and the first way out is no longer than `FARTHEST`
 mean free paths. All other light is left to chance, and so is that of an even sky: its samples add more noise than they
@@ -19,6 +19,7 @@ import numpy as np
 from full_geometry.geometry.points import channel_mean
 from full_geometry.geometry.rounding import before
 from full_geometry.geometry.shape import by_pointer, looked_up, pointer_numbers
+from full_geometry.walk.emission import mis_weight
 from full_geometry.walk.media import WalkMedia, WalkMedium, interaction_of, ray_of
 from full_geometry.walk.random_walk import Event, draw, eval_phase
 from full_geometry.walk.scores import Score, phase_score
@@ -87,8 +88,8 @@ class StraightLight:
         ds, light = emitter.sample_direction(at, mi.Point2f(rng.next_float32(), rng.next_float32()))
         cosine = dr.dot(event.along, ds.d)
         phase = eval_phase(event.m, cosine)
-        a, b = dr.square(ds.pdf / n), dr.square(channel_mean(phase))
-        value = dr.select(ds.pdf > 0, phase * light * (n * dr.select(ds.delta, 1, a / (a + b))), 0)
+        weight = dr.select(ds.delta, 1, mis_weight(ds.pdf / n, channel_mean(phase)))
+        value = dr.select(ds.pdf > 0, phase * light * (n * weight), 0)
         lit = (dr.max(value) > 0) & dr.isfinite(channel_mean(value))
         way = self._way(event, ds, lit, rng)
         result = dr.select(lit & way.arrives, value * way.T, 0)
@@ -113,14 +114,17 @@ class StraightLight:
             T = media.transmittance(k, ray, dr.select(passed, si.t, 0), way.rng, medium)
             o = mi.Point3f(ray.o + ray.d * si.t + media.clear(k, si.n, ray.d))
             going = way.going & (passed | (own & ~way.inside & ~leaves & again))
-            return LightWay(ray_of(o, ray.d, medium), way.left - si.t, ~way.inside, going,
-                            way.arrives | (way.going & ~hit & ~way.inside),
-                            way.length + dr.select(passed, si.t, 0), dr.select(passed, way.T * T, way.T),
-                            way.rng)  # fmt: skip
+            return LightWay(
+                ray=ray_of(o, ray.d, medium), left=way.left - si.t, inside=~way.inside, going=going,
+                arrives=way.arrives | (way.going & ~hit & ~way.inside),
+                length=way.length + dr.select(passed, si.t, 0), T=dr.select(passed, way.T * T, way.T), rng=way.rng,
+            )  # fmt: skip
 
         left = ds.dist - before(ds.p, ds.dist, media.instance_scene.rounding_of(ds.emitter))
-        start = LightWay(ray_of(event.p, ds.d, medium), left, mi.Bool(True) | active, mi.Bool(active),
-                         ~active & active, dr.zeros(mi.Float, dr.width(event.p)), mi.Spectrum(1), rng)  # fmt: skip
+        start = LightWay(
+            ray=ray_of(event.p, ds.d, medium), left=left, inside=mi.Bool(True) | active, going=mi.Bool(active),
+            arrives=~active & active, length=dr.zeros(mi.Float, dr.width(event.p)), T=mi.Spectrum(1), rng=rng,
+        )  # fmt: skip
         return dr.while_loop((start,), lambda way: way.going, lambda way: (go(way),), label="way to an emitter")[0]
 
 

@@ -12,7 +12,7 @@ import pytest
 from test_translucent_walk import COLOURED, _agree, _lamp, _runs, _scene, _small_lamp, _z
 
 from full_geometry.geometry.points import ObjectModel
-from full_geometry.integrators import low_orders
+from full_geometry.integrators import ballistic_and_single
 from full_geometry.transport import half_space, prepare
 from full_geometry.walk import media as walks
 
@@ -110,5 +110,5 @@ def test_each_part_of_the_light_of_a_body_is_counted_once() -> None:
 
 def test_points_of_a_lamp_are_left_to_chance_where_they_are_seen_at_grazing_angles_or_from_behind() -> None:
     n, d = mi.Normal3f(0, 0, 1), mi.Vector3f(*np.array([[0.6, 1, 1, 0.6], [0, 0, 0, 0], [-0.8, -0.06, -0.04, 0.8]]))
-    assert list(low_orders._faces(n, d)) == [True, True, False, False]
-    assert list(low_orders._faces(mi.Normal3f(0), d)) == [True] * 4
+    assert list(ballistic_and_single._faces(n, d)) == [True, True, False, False]
+    assert list(ballistic_and_single._faces(mi.Normal3f(0), d)) == [True] * 4

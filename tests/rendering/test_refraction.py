@@ -14,8 +14,8 @@ mi = pytest.importorskip("mitsuba")
 
 import drjit as dr  # noqa: E402
 
-from full_geometry.integrators import low_orders  # noqa: E402
-from full_geometry.integrators.low_orders import refracted_connection  # noqa: E402
+from full_geometry.integrators import specular_connections  # noqa: E402
+from full_geometry.integrators.specular_connections import refracted_connection  # noqa: E402
 from halfspace_sss.physics.fresnel import F_t, mu_external  # noqa: E402
 
 ETA, RADIUS, N = 1.4, 2.0, 400
@@ -117,8 +117,8 @@ def test_a_connection_by_one_reflection_leaves_towards_its_target_and_knows_how_
     """Against rays in closed form, from random starts; the density as in the test above."""
     p, target = points(5, 0.7), directions(6) * 8
     start = mi.Vector3f(directions(7))
-    met = low_orders._connect(
-        ball, mi.Point3f(p), mi.Point3f(target), start, mi.Bool(True), low_orders.OTHERS, mi.Bool(True)
+    met = specular_connections.connect(
+        ball, mi.Point3f(p), mi.Point3f(target), start, mi.Bool(True), specular_connections.OTHERS, mi.Bool(True)
     )
     valid, d, h = np.array(met.valid), np.array(met.d, dtype=np.float64), 1e-4
 

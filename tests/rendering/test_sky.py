@@ -15,7 +15,7 @@ mi = pytest.importorskip("mitsuba")
 from rendered import surface  # noqa: E402
 
 from full_geometry.geometry.points import ObjectModel  # noqa: E402
-from full_geometry.integrators.lighting import Lights, Sky  # noqa: E402
+from full_geometry.integrators.lighting import EnvironmentMean, Lights  # noqa: E402
 from full_geometry.registry import ModelEntry  # noqa: E402
 from full_geometry.transport import prepare  # noqa: E402
 from full_geometry.transport.half_space import half_space_model  # noqa: E402
@@ -151,6 +151,6 @@ def test_a_sky_with_a_sun_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None
         map = np.full((16, 32, 3), 0.2, np.float32)
         map[4, 5] = sun
         loaded = mi.load_dict(scene(Known, monkeypatch, {"sky": {"type": "envmap", "bitmap": mi.Bitmap(map)}}))
-        return Sky.of(loaded, Lights.of(loaded), loaded.integrator().prepare(loaded))
+        return EnvironmentMean.of(loaded, Lights.of(loaded), loaded.integrator().prepare(loaded))
 
     assert np.allclose(np.array(mean(0.2).mean), 0.2, rtol=1e-3) and mean(500.0) is None

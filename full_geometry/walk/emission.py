@@ -1,0 +1,119 @@
+"""Emission, next-event estimation and their MIS weights: the same for every path, whatever it walks through.
+
+At a vertex with the value f(w) of a BSDF or of a phase function times the cosine, light L_e(w) of emitters is estimated
+by two techniques. The first draws w by emitters, of density p_e, the second by f, of density p_f. With the balance
+heuristic (Veach and Guibas 1995) both together are
+
+    f L_e / p_e  p_e / (p_e + p_f)    +    f L_e / p_f  p_f / (p_e + p_f),
+
+the first at the vertex, by `next_event`, the second where the ray along w meets an emitter, by `emission`. Delta lights
+have the first alone, directions of delta lobes the second. The weight of a path that is one of a mixture, as of entries
+that are drawn by emitters or by a proposal, must be that of this heuristic; so it is that of all.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+
+from full_geometry.geometry.rounding import blocked
+
+if TYPE_CHECKING:
+    from full_geometry.geometry.instances import InstanceScene
+    from full_geometry.geometry.shape import Geometry
+    from full_geometry.surface.wrapped import Wrapping
+
+MOST_SURVIVAL = 0.95  # of Russian roulette
+
+
+def mis_weight(pdf: mi.Float, other: mi.Float) -> mi.Float:
+    """The balance heuristic, pdf / (pdf + other): weight of a sample of one density against a technique of another."""
+    total = pdf + other
+    return dr.select(total > 0, pdf / dr.maximum(total, 1e-30), 0)
+
+
+def survival(size: mi.Float, depth: mi.UInt32, rr_depth: int) -> mi.Float:
+    """The probability min(size, 0.95) to survive Russian roulette; 1 before `rr_depth` vertices."""
+    return dr.select(depth >= rr_depth, dr.minimum(size, MOST_SURVIVAL), 1.0)
+
+
+# ---- First technique: directions drawn by emitters ------------------------------------------------------------------
+
+
+def sample_emitter(
+    scene: mi.Scene, at: mi.Interaction3f, u: mi.Point2f, active: mi.Bool, differentiable: bool = False
+) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
+    """A direction to an emitter with its density p_e, and L_e / p_e, whatever lies between.
+
+    Args:
+        scene: the Mitsuba scene.
+        at: the point that the emitter is seen from.
+        u: uniform numbers.
+        active: lanes that count.
+        differentiable: whether the light carries derivatives by parameters of emitters, with the direction held.
+    """
+    with dr.suspend_grad():
+        ds, light = scene.sample_emitter_direction(at, u, False, active)
+        inverse = dr.select(ds.pdf > 0, dr.rcp(ds.pdf), 0)
+    if not differentiable:
+        return ds, light
+    return ds, dr.replace_grad(light, scene.eval_emitter_direction(at, ds, active & (ds.pdf > 0)) * inverse)
+
+
+def next_event(
+    scene: mi.Scene, instance_scene: InstanceScene, surface: tuple[mi.SurfaceInteraction3f, mi.BSDFPtr], u: mi.Point2f, active: mi.Bool,
+    outwards: mi.Bool | bool = False, differentiable: bool = False,
+) -> mi.Spectrum:  # fmt: skip
+    """Next-event estimation at a surface: f(w) |cos| L_e(w) / p_e with its MIS weight against BSDF sampling.
+
+    Args:
+        scene, u, active, differentiable: as of `sample_emitter`.
+        instance_scene: what rays meet in the scene.
+        surface: a point of a surface and its BSDF.
+        outwards: whether light arrives at its outer side alone, as at a translucent boundary. Of a rough one it may
+            come from below the shading normal; then it is refracted from inside, by the opposite direction.
+    """
+    # w by the emitters of the scene, p_e; delta BSDFs have no value for it
+    si, bsdf = surface
+    active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+    ds, light = sample_emitter(scene, si, u, active, differentiable)
+    with dr.suspend_grad():
+        active &= (ds.pdf > 0) & (~mi.Bool(outwards) | (dr.dot(ds.d, si.n) > 0))
+        # V(x, y): nothing between the surface and the emitter
+        active &= ~blocked(scene, instance_scene.ray_to_emitter(si, ds, instance_scene.rounding(si)), active)
+        wo = si.to_local(ds.d)
+        below = outwards & (wo.z < 0)
+        active &= ~below | (mi.Frame3f.cos_theta(si.wi) < 0)
+    # f |cos| L_e / p_e  p_e / (p_e + p_f); the densities are held in derivatives
+    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, dr.select(below, -wo, wo), active)
+    weight = dr.select(ds.delta, 1, mis_weight(ds.pdf, dr.detach(pdf)))
+    return dr.select(active, value * light * weight, 0)
+
+
+# ---- Second technique: emitters that a ray meets --------------------------------------------------------------------
+
+
+def emitter_pdf(
+    scene: mi.Scene, origin: mi.Interaction3f, si: mi.SurfaceInteraction3f, active: mi.Bool
+) -> tuple[mi.Float, mi.DirectionSample3f]:
+    """p_e, 1/sr, by which `sample_emitter` at the origin of a ray draws the emitter that it meets, and the direction."""
+    ds = mi.DirectionSample3f(scene, si, origin)
+    return scene.pdf_emitter_direction(origin, ds, active), ds
+
+
+def emission(emitter: mi.EmitterPtr, si: mi.SurfaceInteraction3f, weight: mi.Float, active: mi.Bool) -> mi.Spectrum:
+    """Radiance L_e of an emitter that a ray meets, times the MIS weight of having met it."""
+    return dr.select(active, weight * emitter.eval(si, active), 0)
+
+
+# ---- Masks -----------------------------------------------------------------------------------------------------------
+
+
+def unmasked_surface(
+    wrapping: Wrapping, obj: Geometry, si: mi.SurfaceInteraction3f, d: mi.Vector3f, u: mi.Float, here: mi.Bool
+) -> mi.BSDFPtr:
+    """The BSDF that masks and blends around the surface of an object leave for a ray along d, by a uniform number."""
+    behind = (dr.dot(si.n, d) * obj.side(si.prim_index, here) > 0) & obj.closed
+    return wrapping.draw(si, behind, u, here)
