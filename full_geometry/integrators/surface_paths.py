@@ -190,16 +190,21 @@ def _loop(
             active=active | again,
         )
 
-    start = PathState(
-        ray=camera_ray, radiance=PathRadiance(L[0], derivative, mi.Spectrum(0)), throughput=mi.Spectrum(1),
-        previous=_camera_vertex(), depth=mi.UInt32(0), scattered=mi.Bool(scattered), second_pass=mi.Bool(False),
-        needs_second=mi.Bool(False), L_first=mi.Spectrum(0), hit=mi.Bool(False), active=mi.Bool(active),
-    )  # fmt: skip
+    start = _path_start(camera_ray, PathRadiance(L[0], derivative, mi.Spectrum(0)), scattered, active)
     with dr.suspend_grad():
         _, path = dr.while_loop((sampler, start), lambda sampler, path: path.active, step, label="bssrdf")
     two = path.second_pass
     parts = dr.select(two, path.L_first, path.radiance.L), dr.select(two, path.radiance.L, 0)
     return parts, path.radiance, path.hit
+
+
+def _path_start(ray: mi.Ray3f, radiance: PathRadiance, scattered: bool, active: mi.Bool) -> PathState:
+    """A path at the camera, of throughput 1."""
+    return PathState(
+        ray=ray, radiance=radiance, throughput=mi.Spectrum(1), previous=_camera_vertex(), depth=mi.UInt32(0),
+        scattered=mi.Bool(scattered), second_pass=mi.Bool(False), needs_second=mi.Bool(False), L_first=mi.Spectrum(0),
+        hit=mi.Bool(False), active=mi.Bool(active),
+    )  # fmt: skip
 
 
 def _ray_from(origin: PreviousVertex, d: mi.Vector3f, before: mi.Ray3f) -> mi.Ray3f:

@@ -7,7 +7,8 @@ Directions are taken apart: with the directional albedo a(mu) of the model,
 L_k the mean of the incident radiance at point k, weighted by a(mu_i) mu_i. Of each point j the entries s are drawn by
 the distance from it, see `entries`, with directions at both ends, so that under the same light from everywhere the sum
 is an unbiased estimate of what the model gives. Where the model knows its directional albedo (`alpha`), the mean
-radiance c of a sky leaves by that, as in `integrators.lighting.EnvironmentMean`, and rows have but the rest of the light to carry.
+radiance c of the environment leaves by that, as in `integrators.lighting.EnvironmentMean`, and rows have but the rest
+of the light to carry.
 
 What S has beyond that depends on directions mostly as the first event does, which lies towards or away from the other
 end. With w bent by the boundary, less its mean by a(mu) mu, S gets for entry and exit the factors

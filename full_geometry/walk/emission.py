@@ -63,8 +63,8 @@ def sample_emitter(
 
 
 def next_event(
-    scene: mi.Scene, instance_scene: InstanceScene, surface: tuple[mi.SurfaceInteraction3f, mi.BSDFPtr], u: mi.Point2f, active: mi.Bool,
-    outwards: mi.Bool | bool = False, differentiable: bool = False,
+    scene: mi.Scene, instance_scene: InstanceScene, surface: tuple[mi.SurfaceInteraction3f, mi.BSDFPtr], u: mi.Point2f,
+    active: mi.Bool, outwards: mi.Bool | bool = False, differentiable: bool = False,
 ) -> mi.Spectrum:  # fmt: skip
     """Next-event estimation at a surface: f(w) |cos| L_e(w) / p_e with its MIS weight against BSDF sampling.
 
@@ -98,7 +98,7 @@ def next_event(
 def emitter_pdf(
     scene: mi.Scene, origin: mi.Interaction3f, si: mi.SurfaceInteraction3f, active: mi.Bool
 ) -> tuple[mi.Float, mi.DirectionSample3f]:
-    """p_e, 1/sr, by which `sample_emitter` at the origin of a ray draws the emitter that it meets, and the direction."""
+    """The density p_e, 1/sr, by which `sample_emitter` draws the emitter that a ray meets, and the direction to it."""
     ds = mi.DirectionSample3f(scene, si, origin)
     return scene.pdf_emitter_direction(origin, ds, active), ds
 
