@@ -14,7 +14,8 @@ from figures.computing.images import FLIP, RELATIVE_MSE, compared
 from figures.computing.scenes import BUNNY, bunny_scene, prepare
 from figures.parts.part import Part, Result, Task
 from full_geometry.integrators.bssrdf import is_bssrdf
-from full_geometry.scenes import online, reference
+from full_geometry.learning import online
+from full_geometry.scenes import reference
 from full_geometry.scenes.combined import combined
 from full_geometry.scenes.reference_store import Reference
 from full_geometry.trade.image_differences import srgb
@@ -190,11 +191,10 @@ class Snapshots:
         self._started += self.seconds - now
 
 
-def _scene(p: dict[str, Any], model: str, train_seconds: float) -> Any:
+def _scene(p: dict[str, Any], model: str) -> Any:
     from full_geometry.scenes.scene_files import open_scene
 
-    settings = {"train_seconds": train_seconds, "train_error": p["train_error"]}
-    return open_scene(bunny_scene(p["material"], p["size"], p["lights"]), model, settings=settings)
+    return open_scene(bunny_scene(p["material"], p["size"], p["lights"]), model)
 
 
 def trained_online(p: dict[str, Any], folder: Path, seconds: float, train_seconds: float) -> dict[str, Any]:
@@ -222,8 +222,8 @@ def trained_online(p: dict[str, Any], folder: Path, seconds: float, train_second
         result.add(combined(walks[0], image))
 
     image = online.render(
-        _scene(p, p["model"], train_seconds), folder / "online.exr", seed=p["seed"], walked=traced, progress=rendered,
-        seconds=max(seconds - train_seconds, 0.1), interval=1e9,
+        _scene(p, p["model"]), folder / "online.exr", train_seconds=train_seconds, train_error=p["train_error"],
+        seed=p["seed"], walked=traced, progress=rendered, seconds=max(seconds - train_seconds, 0.1), interval=1e9,
     )  # fmt: skip
     result.add(image, last=True)
     return {"snapshots": result, "switch": switch[0], "training": image.about["training"]}
@@ -231,14 +231,14 @@ def trained_online(p: dict[str, Any], folder: Path, seconds: float, train_second
 
 def modelled(p: dict[str, Any], folder: Path, seconds: float) -> Snapshots:
     """The model renders with weights that are there."""
-    return _rendered(_scene(p, p["model"], 0.0), folder / "model.exr", p["seed"] + 1, seconds)
+    return _rendered(_scene(p, p["model"]), folder / "model.exr", p["seed"] + 1, seconds)
 
 
 def walked(p: dict[str, Any], folder: Path, seconds: float) -> Snapshots:
     """Walks alone."""
-    from full_geometry.scenes.scene_files import PATH_TRACED
+    from full_geometry.capabilities import PATH_TRACED
 
-    return _rendered(_scene(p, PATH_TRACED, 0.0), folder / "walked.exr", p["seed"] + 2, seconds)
+    return _rendered(_scene(p, PATH_TRACED), folder / "walked.exr", p["seed"] + 2, seconds)
 
 
 def _rendered(scene: Any, path: Path, seed: int, seconds: float) -> Snapshots:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from full_geometry.learning.model_errors import errors, object_of, transport_of
     from full_geometry.learning.network_fitting import Recipe
     from full_geometry.learning.training import train
-    from full_geometry.scenes.plugins import register
+    from full_geometry.plugins import register
     from full_geometry.transport.storing import load
 
 __all__ = ["Recipe", "errors", "inverse", "load", "object_of", "register", "trade", "train", "transport_of"]
@@ -32,7 +32,7 @@ __getattr__, __dir__ = lazy_names(
         "inverse": "",
         "load": "transport.storing",
         "object_of": "learning.model_errors",
-        "register": "scenes.plugins",
+        "register": "plugins",
         "trade": "",
         "train": "learning.training",
         "transport_of": "learning.model_errors",

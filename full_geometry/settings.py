@@ -34,8 +34,6 @@ class Settings:
         light: "sampled", without bias; "gathered" once for all samples, see `integrators.gathering`: scattered light
             has a little bias and no noise; or "auto", the cheaper of both that keeps the tolerance, by measurement.
         hide_emitters: whether directly visible emitters are left out.
-        train_seconds: time for each object whose model has to learn it first; 0 refuses objects without weights.
-        train_error: relative error under constant light, measured on the way, from which on it has learnt enough.
         tolerance: relative error of the radiance of an object that its model "auto" keeps, if one does.
         choice_share: of the samples of the first sensor's image, that the choice of "auto" may take; see
             `trade.automatic`.
@@ -50,8 +48,6 @@ class Settings:
     entries: int = int(AUTOMATIC)
     hide_emitters: bool = False
     light: str = "sampled"
-    train_seconds: float = 60.0
-    train_error: float = 0.03
     tolerance: float = 0.05
     choice_share: float = 0.1
     model: str = ""
@@ -73,8 +69,6 @@ class Settings:
             raise ValueError(f"geometry must be one of {', '.join(GEOMETRIES)}, got {self.geometry!r}")
         if self.area_share != AUTOMATIC:
             check_interval("area_share", self.area_share, 0.0, 1.0)
-        check_interval("train_seconds", self.train_seconds, 0.0, 1e7)
-        check_interval("train_error", self.train_error, 1e-4, 1.0)
 
     def shared(self) -> dict[str, Any]:
         """What `translucent_walk` understands too."""

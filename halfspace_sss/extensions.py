@@ -3,8 +3,8 @@
 - `halfspace_sss.models`: list of model classes.
 - `halfspace_sss.materials`: path of a material file or folder, or an iterable of `Material`.
 - `halfspace_sss.commands`: name -> function with typer annotations, a further command of `halfspace-sss`.
-- `halfspace_sss.transports`, `halfspace_sss.choosers`, `halfspace_sss.learners`: name of a model -> what makes it of an
-  object, what stands for another by name, what learns it; see `registry`.
+- `halfspace_sss.transports`, `halfspace_sss.learners`: name of a model of objects -> what binds it to an object, what
+  trains it; see `full_geometry.transport.models` and `full_geometry.learning.learners`.
 
 What a package offers may fail in any way: it is left out with a warning in one line that names it, and nothing else is.
 """
@@ -17,7 +17,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 COMMANDS, MODELS = "halfspace_sss.commands", "halfspace_sss.models"
-CHOOSERS, LEARNERS, TRANSPORTS = "halfspace_sss.choosers", "halfspace_sss.learners", "halfspace_sss.transports"
+LEARNERS, TRANSPORTS = "halfspace_sss.learners", "halfspace_sss.transports"
 FAILURES = (Exception, SystemExit)  # what code of somebody else may end with
 OWN = "halfspace-sss"  # the distribution whose entry points come first
 
@@ -30,10 +30,11 @@ def warn_left_out(group: str, name: str, error: object) -> None:
 
 
 def offers(group: str) -> dict[str, EntryPoint]:
-    """The entry points of a group by name, the first of each, those of this project before others; none is loaded."""
+    """The entry points by which packages of others join a group, the first of each name; none is loaded."""
     results: dict[str, EntryPoint] = {}
-    for entry in _entries(group):
-        results.setdefault(entry.name, entry)
+    for entry in entry_points(group=group):
+        if entry.dist is None or entry.dist.name != OWN:
+            results.setdefault(entry.name, entry)
     return results
 
 

@@ -55,7 +55,7 @@ def _scene(model: str) -> Any:
     return mi.load_dict(
         {
             "type": "scene",
-            "integrator": {"type": "bssrdf", "mm_per_unit": 3.0, "train_seconds": 0.0},
+            "integrator": {"type": "bssrdf", "mm_per_unit": 3.0},
             "sensor": {"type": "perspective", "fov": 20.0, "to_world": view, "film": film},
             "wax": {"type": "sphere", "bsdf": {"type": "translucent", **MEDIUM, "model": model}},
             "light": {"type": "constant"},
@@ -64,7 +64,7 @@ def _scene(model: str) -> Any:
 
 
 def _learn(scene: Any, folder: Path, seed: int) -> Any:
-    from full_geometry.scenes.learners import learner
+    from full_geometry.learning.learners import learner
 
     how = {"object": None, "seconds": 0.5, "target_error": None, "folder": folder, "work": None, "progress": None}
     return learner("full_geometry").train(scene, seed=seed, **how)

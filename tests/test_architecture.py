@@ -3,29 +3,37 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
 ROOT = Path(__file__).resolve().parent.parent
 ORDER = ["benchmarks", "figures", "full_geometry", "analytic_models", "halfspace_sss"]  # imports go to the right
 SOURCES = sorted(path for package in ORDER for path in (ROOT / package).rglob("*.py"))
 HEAVY = ["torch", "mitsuba", "matplotlib", "drjit", "pandas", "xarray"]
-FLOORS = {  # of each package, a room may import those to its left; "" is what lies beside the rooms
+FLOORS = {  # of each package, a room or file may import those to its left; "" is all other files
     "halfspace_sss": [
         "", "physics", "interface", "tracing", "maps", "measure", "materials", "comparison", "neural",
         "neural.training", "cli",
     ],
     "full_geometry": [
         "", "geometry", "surface", "objects", "walk", "sampling", "transport", "precomputed", "integrators", "scenes",
-        "learning", "inverse", "trade", "cli",
+        "learning", "inverse", "trade", "plugins", "cli",
     ],
     "figures": ["parts", "rivals", "modelling", "computing", "drawing", "beyond", ""],
 }  # fmt: skip
+ENTRY_POINTS = {"halfspace_sss.models"}  # by which packages above join the plane
 HIDING = {"bssrdf", "curves", "models", "trace"}  # public functions: a folder of that name would hide one
 LONGEST_BODY = 60
+ADDRESS = re.compile(r"[a-z_]\w*(?:\.\w+)+(?::\w+)?")  # "package.module" or "package.module:name"
 MOST_ANY = 150  # parameters in `rendering` whose type is left open
 
 
@@ -53,9 +61,10 @@ MODULES = {_name(path): path for path in SOURCES}
 
 
 def _room(module: str) -> str:
-    """The folder of a module below its package; a package within is in itself."""
+    """The folder of a module below its package, or its name if it is a floor itself; a package within is in itself."""
+    package, _, name = module.partition(".")
     folder = MODULES[module].parent.relative_to(ROOT).parts
-    return ".".join(folder[1:])
+    return name if name in FLOORS.get(package, ()) else ".".join(folder[1:])
 
 
 def _module(name: str) -> str | None:
@@ -66,9 +75,10 @@ def _module(name: str) -> str | None:
 
 
 def _arrows(path: Path) -> set[str]:
-    """Modules of this project that a file imports, also inside functions; the doors of a package do not count.
+    """Modules of this project that a file imports, also inside functions, or names in a text of its code.
 
-    Doors are the names that an `__init__` imports for type checkers and opens when they are asked for.
+    The doors of a package do not count: names that an `__init__` imports for type checkers and opens when they are
+    asked for.
     """
     tree = _tree(path)
     if path.name == "__init__.py":
@@ -79,6 +89,8 @@ def _arrows(path: Path) -> set[str]:
             names |= {alias.name for alias in node.names}
         if isinstance(node, ast.ImportFrom) and not node.level:
             names |= {f"{node.module}.{alias.name}" for alias in node.names}
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and ADDRESS.fullmatch(node.value):
+            names |= {node.value.replace(":", ".")} - {_name(path).rpartition(".")[0]}  # whose files it reads
     return {found for name in names if (found := _module(name))} - {_name(path)}
 
 
@@ -129,6 +141,16 @@ def test_a_room_imports_only_rooms_below_it(package: str) -> None:
         and floors.index(_room(target)) > floors.index(_room(module))
     }
     assert not up
+
+
+def test_a_module_that_is_named_in_a_text_counts_as_imported() -> None:
+    assert "full_geometry.transport.lambert" in ARROWS["full_geometry.transport.models"]
+    assert "full_geometry.trade.automatic" in ARROWS["full_geometry.plugins"]
+
+
+def test_the_entry_points_of_the_project_are_those_that_the_plane_cannot_name() -> None:
+    points = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["entry-points"]
+    assert set(points) == ENTRY_POINTS
 
 
 def test_no_modules_import_each_other_in_a_circle() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from figures.computing.scenes import long_render, prepare, scan_scene
 from figures.parts.part import Task, unmodelled
-from full_geometry.registry import model_names
+from full_geometry.transport.models import model_names
 from halfspace_sss import bssrdf
 from halfspace_sss.neural.symmetric import channels
 from halfspace_sss.physics.medium import Medium

@@ -23,14 +23,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from figures import figure_modules
-from full_geometry.registry import learnt_names, lookup, model_names
+from full_geometry.capabilities import AUTO
+from full_geometry.learning.learners import LEARNERS
+from full_geometry.plugins import TRADE
+from full_geometry.transport.models import lookup, model_names
 from halfspace_sss.checks import check_choice, check_interval
 from halfspace_sss.interface.model import no_models
 from halfspace_sss.progress import Progress
 
 PACKAGES = ("benchmarks", "figures", "full_geometry", "analytic_models", "halfspace_sss")
 MACHINERY = "figures.parts"  # keeps and orders what parts compute, and computes nothing of it
-RENDERS = "full_geometry.registry"  # is imported by all that finds models of objects
+RENDERS = "full_geometry.transport.models"  # is imported by all that finds models of objects
 NAMES = "halfspace_sss.extensions"  # knows the names of packages, and asks for none of what they offer
 ADDRESS = re.compile(r"[a-z_]\w*(?:\.\w+)+(?::\w+)?")  # "package.module" or "package.module:function"
 
@@ -79,7 +82,8 @@ def modules_reached(module: str, function: str, params: str = "", unmodelled: bo
 @functools.cache
 def found_by_name() -> dict[str, tuple[str, ...]]:
     """Modules of models, of the half-space and of objects, and of what learns them, by name."""
-    return {name: lookup(name).modules for name in (*model_names(), *learnt_names())}
+    known = {name: (lookup(name).module,) for name in model_names()} | {AUTO: (TRADE,)}
+    return known | {name: (*known.get(name, ()), place) for name, place in LEARNERS.items()}
 
 
 def modules_of(roots: Iterable[str]) -> list[str]:

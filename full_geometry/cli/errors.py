@@ -15,7 +15,7 @@ from halfspace_sss.cli.errors import write_errors
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from full_geometry.scenes.learners import ObjectError
+    from full_geometry.learning.records import ObjectError
 
 DEFINITION = (
     "error: relative RMSE of the radiance of random exits under constant light, of four lobes cos^16, or as images "
@@ -41,7 +41,7 @@ def errors_object(
     use_mitsuba(variant)
     import pandas
 
-    from full_geometry.scenes.learners import object_errors
+    from full_geometry.learning.learners import object_errors
     from full_geometry.scenes.scene_files import load_objects
 
     how = {"object": object, "seed": seed, "exits": exits}

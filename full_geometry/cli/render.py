@@ -69,17 +69,18 @@ class TransportOptions:
         ),
     ] = None
     train_seconds: Annotated[
-        float | None,
-        typer.Option(help="Time to learn an object without weights; 0 refuses it.", show_default="60, or the scene's"),
-    ] = None
-    train_error: Annotated[
-        float | None, typer.Option(help="Error at which it has learnt enough.", show_default="0.03, or the scene's")
-    ] = None
+        float, typer.Option(help="Train each object without weights first, for so long; 0 refuses it.")
+    ] = 0.0
+    train_error: Annotated[float, typer.Option(help="Error at which an object is trained enough.")] = 0.03
 
     def settings(self, denoise: bool) -> dict[str, Any]:
         """Of the integrator, those that are given."""
-        given = {"train_seconds": self.train_seconds, "train_error": self.train_error, "light": self.light}
-        return {name: value for name, value in {**given, "layers": denoise or None}.items() if value is not None}
+        given = {"light": self.light, "layers": denoise or None}
+        return {name: value for name, value in given.items() if value is not None}
+
+    def training(self) -> dict[str, float]:
+        """As `learning.online.render` takes it."""
+        return {"train_seconds": self.train_seconds, "train_error": self.train_error}
 
 
 def render(
@@ -99,8 +100,8 @@ def render(
 ) -> None:
     """Render a scene: NAME_MODEL.exr with variance, .png, and .html; error, samples and time are printed.
 
-    Until it is done, NAME_MODEL.unfinished.exr holds it, and the files of before stay. Objects whose model has to learn
-    them are learnt first, where they have no weights, from walks that join the image.
+    Until it is done, NAME_MODEL.unfinished.exr holds it, and the files of before stay. Objects whose model has to be
+    trained are trained first where --train-seconds says so, by walks that join the image.
     """
     use_mitsuba(variant)
     from full_geometry.integrators.bssrdf import is_bssrdf
@@ -124,7 +125,7 @@ def render(
         name = [scene.stem, transport.model or "scene", transport.light or "", f"sensor{k}" if k else ""]
         file = out / f"{'_'.join(filter(None, name))}.exr"
         with one_writer(file):
-            result = _rendered(loaded, file, limits, {"seed": seed, "sensor": k}, resume)
+            result = _rendered(loaded, file, limits, {"seed": seed, "sensor": k, **transport.training()}, resume)
             emission = result.mean[..., -3:] if getattr(loaded.integrator(), "layers", False) else None
             told, error = _numbers(result), _error(result)
             picture = Picture(file.stem, _colours(result.mean), told, error, loaded, k, denoise, emission)
@@ -164,9 +165,9 @@ def _unfinished(file: Path) -> Path:
     return file.with_suffix(".unfinished.exr")
 
 
-def _rendered(scene: Any, file: Path, limits: Limits, which: dict[str, int], resume: bool) -> Reference:
+def _rendered(scene: Any, file: Path, limits: Limits, which: dict[str, Any], resume: bool) -> Reference:
     """The render, in files of another name until it is done."""
-    from full_geometry.scenes import online
+    from full_geometry.learning import online
     from full_geometry.scenes.scene_files import first_cause
     from halfspace_sss.backend import BackendError
 

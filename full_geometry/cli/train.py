@@ -14,7 +14,7 @@ from halfspace_sss.cli import shared
 from halfspace_sss.cli.train import ResultOptions, Work, need_torch
 
 if TYPE_CHECKING:
-    from full_geometry.scenes.learners import LearntObject
+    from full_geometry.learning.records import LearntObject
 
 Seconds = Annotated[float, typer.Option(help="Time for data and fit, without compiling.")]
 
@@ -44,8 +44,8 @@ def train_object(
     need_torch()
     parameters = shared.defined(define)
     use_mitsuba(variant)
+    from full_geometry.learning.learners import learner
     from full_geometry.objects.objects import object_of
-    from full_geometry.scenes.learners import learner
     from full_geometry.scenes.scene_files import load_objects
     from halfspace_sss.executors import completed
 
@@ -77,7 +77,7 @@ def _train(
     """The network of an object of a scene file, by its parameters, variant and learner; on a worker without a bar."""
     scene, parameters, variant, model = of
     use_mitsuba(variant)
-    from full_geometry.scenes.learners import learner
+    from full_geometry.learning.learners import learner
     from full_geometry.scenes.scene_files import load_objects
 
     return learner(model).train(load_objects(scene, parameters), **how, progress=bar.told if bar else None)
@@ -105,11 +105,9 @@ def train_shapes(
     if find_spec("igl") is None:
         raise ValueError("training on shapes needs libigl: `pip install halfspace-sss[train]`")
     use_mitsuba("llvm_ad_mono")
-    from full_geometry.scenes.learners import shape_learner
+    from full_geometry.learning.shape_training import train_shapes
 
     with shared.Bar("shapes") as bar:
-        result = shape_learner().train_shapes(
-            out, seconds=seconds, seed=seed, meshes=mesh or [], work=work, progress=bar.told
-        )
+        result = train_shapes(out, seconds=seconds, seed=seed, meshes=mesh or [], work=work, progress=bar.told)
     shared.say(f"{result.objects} objects, {result.steps} steps in {result.seconds:.0f} s; written:")
     shared.say_files([result.path])

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import drjit as dr
 import mitsuba as mi
 
+from full_geometry.capabilities import Choices
 from full_geometry.geometry import mesh
 from full_geometry.geometry.instances import InstanceScene
 from full_geometry.geometry.sensors import (
@@ -28,12 +29,11 @@ from full_geometry.integrators.lit_entries import LitEntries
 from full_geometry.integrators.surface_paths import replay_paths, trace_paths
 from full_geometry.objects.objects import KnowsUnit, TranslucentObject
 from full_geometry.objects.small_emitters import check_emitters
-from full_geometry.registry import Choices
 from full_geometry.sampling.low_discrepancy import path_numbers
 from full_geometry.settings import Settings, read_settings
 from full_geometry.surface.translucent import is_translucent
 from full_geometry.surface.wrapped import wraps
-from full_geometry.transport.prepare import TranslucentObjects, make_objects
+from full_geometry.transport.prepare import Chooser, TranslucentObjects, choices_of, make_objects
 from halfspace_sss.interrupts import interruptible
 
 SAMPLES_PER_LAUNCH = 2**20  # half a second on 2 cores
@@ -61,18 +61,21 @@ def _class(variant: str) -> type:
     class BSSRDFIntegrator(mi.SamplingIntegrator):
         """Renders scenes with `translucent` objects; parameters as in `Settings`.
 
-        An object whose model has to learn it, and has not, is learnt while the scene is prepared, from walks that do
-        not serve the image; `scenes.online.render` and `halfspace-sss render` use them for both.
+        It trains nothing: an object whose model has to be trained, and has not been, is refused.
 
         Images can be differentiated by emitters, surfaces, textures and the medium of each object (`albedo`, `sigma_t`,
         `g`), forward and backward; where paths go is held, and derivatives by geometry are refused.
+
+        Args:
+            props: the parameters.
+            choose: says what stands for the model "auto" in a scene.
         """
 
-        def __init__(self, props: mi.Properties) -> None:
+        def __init__(self, props: mi.Properties, choose: Chooser) -> None:
             mi.SamplingIntegrator.__init__(self, props)
             self.settings = read_settings(props)
             self.mm_per_unit = self.settings.mm_per_unit
-            self._objects = TranslucentObjects(self.settings)
+            self._objects = TranslucentObjects(self.settings, choose)
             self.gathering = Gathering()
             self._lit_entries = LitEntries()
             self._lit: list[TranslucentObject] | None = None  # while an image is rendered
@@ -100,7 +103,7 @@ def _class(variant: str) -> type:
             check_parameters(scene)
             check_emitters(scene)
             with dr.suspend_grad():
-                make_objects(scene, self.settings, without)
+                make_objects(scene, self.settings, choices_of(scene, self.settings, self._objects.choose), without)
 
         def render(
             self, scene: mi.Scene, sensor: mi.Sensor | int = 0, seed: mi.UInt32 | int = 0, spp: int = 0,

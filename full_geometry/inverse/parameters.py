@@ -12,10 +12,10 @@ import numpy as np
 from full_geometry.geometry.shape import name_of
 from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.objects.objects import KnowsUnit, translucent_shapes
-from full_geometry.registry import lookup
 from full_geometry.surface.medium_derivatives import MediumDerivatives
 from full_geometry.surface.translucent import VARIABLE
 from full_geometry.surface.wrapped import surface_of
+from full_geometry.transport.models import lookup
 from halfspace_sss.checks import check_choice
 from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.neural.universal import Neural
@@ -57,8 +57,9 @@ def check_derivatives(integrator: mi.Integrator, shape: mi.Shape, names: Sequenc
     if settings.light != "sampled":
         raise ValueError(f"light must be sampled to fit a medium, got {settings.light}")
     model = settings.model or spec.model
+    capabilities = lookup(model).capabilities
     if spec.textured is not None:
-        made = bssrdf(model, spec.channels()[0]) if lookup(model).of_half_space else None
+        made = bssrdf(model, spec.channels()[0]) if capabilities.of_half_space else None
         if made is None or (made.checksums and not isinstance(made, Neural)):
             raise ValueError(
                 f"model must have derivatives by textures, got {model!r}: analytic models and neural have them"
@@ -67,7 +68,8 @@ def check_derivatives(integrator: mi.Integrator, shape: mi.Shape, names: Sequenc
             raise ValueError(f"g must not be fitted beside textures by {model!r}: translucent_walk has its derivative")
         return
     coefficients = ["sigma_t" if name == "mfp" else name for name in names]
-    MediumDerivatives(surface_of(shape), integrator.mm_per_unit, model).check(n for n in coefficients if n in VARIABLE)
+    derivatives = MediumDerivatives(surface_of(shape), integrator.mm_per_unit, model, capabilities.derivatives)
+    derivatives.check(n for n in coefficients if n in VARIABLE)
 
 
 def check_names(names: Sequence[str], known: Sequence[str]) -> None:

@@ -24,10 +24,10 @@ import numpy as np
 
 from full_geometry.geometry.points import SurfacePoint, Transport, evaluate
 from full_geometry.objects.objects import TranslucentObject, object_of, refuse, refuse_textures
-from full_geometry.registry import check_model, lookup, model_names
 from full_geometry.settings import Settings
 from full_geometry.transport.exit_pairs import EntryProposals, trace_exits
 from full_geometry.transport.half_space import HalfSpaceTransport
+from full_geometry.transport.models import lookup
 from full_geometry.transport.one_object import HalfSpace
 from full_geometry.transport.patches import ExitTable
 from full_geometry.transport.storing import KIND, find_weights, load
@@ -307,17 +307,16 @@ def transport_of(obj: TranslucentObject, model: str, folder: str | os.PathLike |
         ValueError: the object has not been trained, there is no such model, it refuses the object as renders would, or
             it has no S for two points of a surface.
     """
-    check_model(model, model_names())
     inclusions, entry = obj.geometry.inclusions, lookup(model)
-    if inclusions is not None and not entry.takes_contents:
+    if inclusions is not None and not entry.capabilities.inclusions:
         refuse(inclusions.found[0], obj.geometry, f"the model {model!r}")
     if model == KIND:
         return load(find_weights(obj, folder), obj).model
     if obj.textured is not None:
         refuse_textures(obj.geometry.name, f"errors of {model!r}")
-    if not entry.knows_objects:
+    if entry.capabilities.of_half_space:
         return HalfSpaceTransport([bssrdf(model, m) for m in obj.media])
-    transport = entry.transport(obj, Settings()).transport if entry.transport else None
-    if transport is None or transport.is_delta:
+    transport = entry.transport(obj, Settings()).transport
+    if transport.is_delta:
         raise ValueError(f"model must be one that has S for two points of a surface, got {model!r}")
     return transport

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from full_geometry.learning.model_errors import RadianceError, errors_of, transport_of
+from full_geometry.learning.records import LearntObject, ObjectError
 from full_geometry.objects.objects import TranslucentObject, object_of, outermost
-from full_geometry.registry import model_names
-from full_geometry.scenes.learners import LearntObject, ObjectError
 from full_geometry.surface.wrapped import surface_of
+from full_geometry.transport.models import model_names
 from full_geometry.transport.storing import KIND, find_weights, trained
 from halfspace_sss.checks import check_count
 from halfspace_sss.interface.model import models as half_space_models

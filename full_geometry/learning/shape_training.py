@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import nn
 
+from full_geometry.learning.records import LearntShapes
 from full_geometry.learning.shape_data import GroupedPairs, PairData, draw_object, grouped, make_data, mean_events
-from full_geometry.scenes.learners import LearntShapes
 from full_geometry.transport.any_shape import ALBEDO, ETA, KIND, LEAST, PLACE_OF_G, SIZE, WEIGHTS, G, most
 from full_geometry.transport.descriptors import CURVED_OWN, CURVED_SHARED, N_MEDIUM, N_OWN, N_SHARED
 from halfspace_sss.checks import check_count, check_interval
@@ -54,8 +54,7 @@ class ShapeRecipe:
         check_interval("rate", self.rate, 1e-8, 1.0)
 
 
-Recipe = ShapeRecipe  # its name in `full_geometry.learning.shape_learner`
-STANDARD = Recipe()
+STANDARD = ShapeRecipe()
 
 
 class ShapeNetwork(nn.Module):

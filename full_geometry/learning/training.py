@@ -234,7 +234,7 @@ def train(
     camera: Any = None,
     progress: Progress | None = None,
     base_model: str | None = None,
-    start: storing.Neighbour | None = None,
+    refine: bool = False,
 ) -> Trained:
     """Learn S of an object and write its weights.
 
@@ -256,10 +256,11 @@ def train(
         camera: a `CameraWalks`, whose walks join those of random exits.
         progress: called with (what, done, total).
         base_model: `neural_shape` or a half-space model, with its rate; by default the recipe's.
-        start: weights of the same shape with another medium, from which the networks begin, see `storing.nearest`.
+        refine: begin from the weights of the same shape with the medium that is most alike, see `storing.nearest`.
 
     Raises:
-        ValueError: an argument is out of range, or `work` is of another run; nothing has been traced then.
+        ValueError: an argument is out of range, there are no weights to refine, or `work` is of another run; nothing
+            has been traced then.
     """
     obj = shape if isinstance(shape, TranslucentObject) else object_of(shape, medium, mm_per_unit, object)
     check_interval("seconds", seconds, 0.0, 1e7)
@@ -274,6 +275,9 @@ def train(
     if not any(float(m.sigma_s) > 0 for m in obj.media):
         raise ValueError("medium must scatter in at least one channel to be learnt, got sigma_s 0 in all")
     recipe = recipe if base_model is None else recipe.with_base_model(base_model)
+    start = storing.nearest(obj, asdict(recipe), folder) if refine else None
+    if refine and start is None:
+        raise ValueError(f"refine must have weights of the same shape and a medium alike in {folder}, got none")
     recipe = recipe if start is None else recipe.refining()
     run = _ObjectTraining(obj, recipe, int(seed), Path(work) if work else None, camera, start)
     if seconds == 0:

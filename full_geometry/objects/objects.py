@@ -17,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.capabilities import Capabilities
 from full_geometry.geometry import mesh
 from full_geometry.geometry.instances import (
     InstanceProposals,
@@ -48,7 +49,6 @@ from full_geometry.geometry.shape import (
 )
 from full_geometry.geometry.snapshot import Snapshot
 from full_geometry.objects.inclusions import Inclusion, find_inclusions, place_of
-from full_geometry.registry import lookup
 from full_geometry.surface.medium_derivatives import MediumDerivatives
 from full_geometry.surface.spectral import MediumByWavelength
 from full_geometry.surface.textured import MediumAt, TexturedMedium
@@ -231,6 +231,7 @@ class TranslucentObject:
         low_orders: the orders below two that are traced beside it: (0, 1), (1,) or none.
         expected: what each kind of light is expected to bring.
         derivatives: of its light by its medium.
+        capabilities: of its model; None of one that is not rendered.
         gathered: what leaves by orders from two on, in place of a transport, see `integrators.gathering`.
         painted: its shape as it was, whose attributes textures show, if the surface has textures.
         instance_scene: of the scene that it is rendered in.
@@ -247,6 +248,7 @@ class TranslucentObject:
     low_orders: tuple[int, ...] = ()
     expected: Expected | None = None
     derivatives: MediumDerivatives | None = None
+    capabilities: Capabilities | None = None
     gathered: Any = None
     painted: Snapshot | None = None
     instance_scene: InstanceScene = InstanceScene([], {})
@@ -268,7 +270,7 @@ class TranslucentObject:
             proposals = InstanceProposals(proposals, transform)
             if self.is_mixed:
                 transport = replace(transport, obj=geometry)
-            elif lookup(self.derivatives.model).transport is not None:
+            elif not self.capabilities.of_half_space:
                 transport = InstanceTransport(transport, transform)
         return replace(self, geometry=geometry, transport=transport, proposals=proposals)
 
@@ -276,7 +278,7 @@ class TranslucentObject:
     def is_mixed(self) -> bool:
         """Whether half-space models are mixed over its texture or spectrum, see `transport.palette`."""
         varies = self.textured is not None or self.spectral is not None
-        return varies and lookup(self.derivatives.model).of_half_space
+        return varies and self.capabilities.of_half_space
 
     @functools.cached_property
     def wrapping(self) -> Wrapping:

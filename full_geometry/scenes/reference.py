@@ -20,10 +20,10 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.capabilities import AUTO
 from full_geometry.geometry.identity import children, scene_hash, words
 from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.objects.objects import translucent_shapes
-from full_geometry.registry import AUTO
 from full_geometry.scenes.reference_store import BY_CHANCE, CHANNELS, Reference, load, save
 from full_geometry.scenes.scene_files import first_cause
 from full_geometry.surface.wrapped import surface_of

@@ -15,10 +15,11 @@ from typing import Any
 
 import mitsuba as mi
 
+from full_geometry.capabilities import PATH_TRACED
 from full_geometry.integrators.bssrdf import is_bssrdf
-from full_geometry.registry import PATH_TRACED, lookup, model_names
 from full_geometry.settings import LIGHTS, ORDERS, SHARED, WALK_LIGHTS
 from full_geometry.surface.wrapped import surface_of
+from full_geometry.transport.models import model_names, of_objects
 from halfspace_sss.interrupts import is_interrupt
 
 _HERE = str(Path(__file__).parents[3])
@@ -108,7 +109,7 @@ def load_scene(
     parameters: Mapping[str, str] | None = None,
     settings: Mapping[str, float] | None = None,
 ) -> Any:
-    """A Mitsuba scene with translucent objects, ready to be rendered: objects without weights are learnt here.
+    """A Mitsuba scene with translucent objects, ready to be rendered.
 
     Where model or orders are asked for and the integrator of the scene shows no light from inside, ours takes its
     place, with its mm_per_unit, max_depth, rr_depth and hide_emitters; a warning says so. A scene without integrator
@@ -141,7 +142,7 @@ def open_scene(
     settings: Mapping[str, float] | None = None,
     floats: bool = False,
 ) -> Any:
-    """As `load_scene`, but nothing is prepared yet: no model is made, and no object is learnt.
+    """As `load_scene`, but nothing is prepared yet: no model is made.
 
     With `floats`, texels of bitmaps are floats, which can be changed by any amount, whatever their files have.
     """
@@ -155,7 +156,7 @@ def open_scene(
     # a model that knows whole objects does not know what Mitsuba makes of several with the same BSDF
     names = [str(props.get("model", "")) for props in _surfaces(state)]
     config.merge_meshes = not any(
-        name in model_names() and lookup(name).knows_objects for name in (*names, "" if walks else model)
+        name in model_names() and of_objects(name) for name in (*names, "" if walks else model)
     )
     _transform(scene, state, config)
     for props in _surfaces(state):  # anew: the nodes have moved

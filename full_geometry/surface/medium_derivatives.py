@@ -18,7 +18,6 @@ import drjit as dr
 import mitsuba as mi
 
 from full_geometry.geometry.points import SurfacePoint, Transport, TransportAround, opaque
-from full_geometry.registry import lookup
 from full_geometry.surface.translucent import VARIABLE
 from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.physics.medium import Medium
@@ -71,10 +70,12 @@ class MediumDerivatives:
         surface: its `translucent` BSDF, whose parameters are differentiated by.
         mm_per_unit: length of a scene unit, mm.
         model: name of the object's model.
+        plane: name of the half-space model that knows the same media; "" where the model has no derivatives by them.
     """
 
-    def __init__(self, surface: Any, mm_per_unit: float, model: str) -> None:
-        self.surface, self.spec, self.mm_per_unit, self.model = surface, surface.spec, mm_per_unit, model
+    def __init__(self, surface: Any, mm_per_unit: float, model: str, plane: str) -> None:
+        self.surface, self.spec, self.mm_per_unit = surface, surface.spec, mm_per_unit
+        self.model, self.plane = model, plane
         self._stencils: dict[str, Stencil] = {}
 
     def prepare(self, transport: Transport | None) -> None:
@@ -110,8 +111,7 @@ class MediumDerivatives:
 
     def _places(self, name: str, m: Medium) -> tuple[list[Medium], list[float]]:
         """The media of a channel on both sides, 1/(scene unit), and the coefficients."""
-        plane = lookup(self.model).varies_as
-        if plane is None:
+        if not self.plane:
             raise ValueError(
                 f"model must have derivatives by the medium, got {self.model!r}: translucent_walk, neural_shape and "
                 "models of the half-space have them"
@@ -123,7 +123,7 @@ class MediumDerivatives:
             try:
                 media = [self._medium(m, name, value + h * offset) for offset in offsets]
                 for each in media:
-                    bssrdf(plane, each)
+                    bssrdf(self.plane, each)
                 return media, [c / h for c in coefficients]
             except ValueError as error:
                 refusals.append(str(error))

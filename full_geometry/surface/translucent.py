@@ -46,6 +46,7 @@ from __future__ import annotations
 import functools
 import math
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -54,7 +55,6 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.geometry.points import mirrored, opaque
-from full_geometry.registry import check_model, model_names
 from full_geometry.settings import ORDERS, check_parameters, variant_channels
 from full_geometry.surface.spectral import EVERYWHERE, MediumByWavelength, read_file, spectral_medium
 from full_geometry.surface.textured import constant_texture, textured_medium
@@ -283,12 +283,18 @@ def _class(variant: str) -> type:
     """The class of a variant, which must be the current one."""
 
     class Translucent(mi.BSDF):
-        """The reflection of the boundary as a BSDF; `spec` says what is below."""
+        """The reflection of the boundary as a BSDF; `spec` says what is below.
 
-        def __init__(self, props: mi.Properties) -> None:
+        Args:
+            props: the parameters.
+            check_model: raises ValueError for the name of a model that does not exist.
+        """
+
+        def __init__(self, props: mi.Properties, check_model: Callable[[str], None]) -> None:
             mi.BSDF.__init__(self, props)
             check_parameters("translucent", props, (*PARAMETERS, *(key for key, _ in _boundaries(props))))
             self.spec = read_medium_spec(props)
+            check_model(self.spec.model)
             self.boundary = boundary_of([inner for _, inner in _boundaries(props)], self.spec.medium.eta)
             self.reflection = Reflection.of(self.boundary)
             self.m_components = [self.boundary.flags(self.reflection.lobe)]
@@ -508,7 +514,6 @@ def read_medium_spec(props: mi.Properties) -> MediumSpec:
         (label, medium, varying, textured), spectral = _medium(props), None
     model, orders = props.get("model", "neural"), props.get("orders", "total")
     check_choice("orders", orders, ORDERS)
-    check_model(model, model_names())
     return MediumSpec(label, medium, model, orders, bool(props.get("reflection", True)), varying, textured, spectral)
 
 

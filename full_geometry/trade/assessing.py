@@ -8,8 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from full_geometry.registry import lookup
-from full_geometry.scenes.learners import CostedLearner, Learner, learner
+from full_geometry.learning.learners import Learner, learner
 from full_geometry.scenes.scene_files import PATH_TRACED, first_cause
 from full_geometry.trade.contending import (
     DEAR_SECONDS,
@@ -23,6 +22,7 @@ from full_geometry.trade.measuring import OWN_SHARE, LookBudget, SceneSamples
 from full_geometry.trade.results import Assessment, WayTrade
 from full_geometry.trade.statistics import seeded
 from full_geometry.trade.ways import GATHERED, WALKS, Stage, Way, stage, ways
+from full_geometry.transport.models import lookup
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.progress import NamedProgress
 
@@ -183,7 +183,7 @@ def _assessed_for(
         out = too_dear(look, first, chosen, tolerance, images) if count_training else {}
         ahead, later = ([way for way in ways if way not in out] for ways in (ahead, later))
         look.keep(first)
-        flat = [way for way in ahead if not way.walks and lookup(way.model).of_half_space]
+        flat = [way for way in ahead if not way.walks and lookup(way.model).capabilities.of_half_space]
         look.more(flat[:1], LookBudget(), seeded(seed, 45), progress)
         out |= as_far_off(look.assessment(seed), flat, later, tolerance)
         ahead, later = ([way for way in ways if way not in out] for ways in (ahead, later))
@@ -264,8 +264,6 @@ def learn(on: Stage, seconds: float, seed: int = 0, progress: NamedProgress | No
 
 
 def _is_learnt(learns: Learner, scene: Any, object: str) -> bool:
-    if not isinstance(learns, CostedLearner):
-        return False
     try:
         learns.cost(scene, object)
     except ValueError:

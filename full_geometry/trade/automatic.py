@@ -17,14 +17,15 @@ from typing import Any, NamedTuple
 
 import mitsuba as mi
 
+from full_geometry.capabilities import AUTO, Choices
 from full_geometry.geometry.identity import scene_hash
 from full_geometry.objects.objects import refuse_instances, translucent_shapes
-from full_geometry.registry import AUTO, Choices, model_names
 from full_geometry.settings import Settings
 from full_geometry.surface.wrapped import surface_of
 from full_geometry.trade.assessing import assess_stage
 from full_geometry.trade.results import ObjectTrade, WayTrade
 from full_geometry.trade.ways import GATHERED, LAMBERT, WALKS, Stage, Way
+from full_geometry.transport.models import model_names
 from halfspace_sss.neural.store import weights_folder
 from halfspace_sss.provenance import provenance, write_atomically
 

@@ -10,8 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from full_geometry.registry import learnt_names, lookup
-from full_geometry.scenes.learners import CostedLearner
+from full_geometry.learning.learners import learners
 from full_geometry.scenes.scene_files import first_cause
 from full_geometry.surface.wrapped import surface_of
 from full_geometry.trade.exits import Exits, visible_exits
@@ -311,14 +310,10 @@ def _of_blur(blurred: RadianceEstimate, b: RadianceEstimate) -> Number:
 
 
 def training_seconds(scene: Any, object: str, model: str) -> float:
-    """Seconds that the weights of a model of an object took to learn; 0 without any, where the model itself says why.
-
-    A learner of the group `halfspace_sss.learners` tells them by a function `cost(scene, object)`.
-    """
-    learns = lookup(model).learner if model in learnt_names() else None
-    if not isinstance(learns, CostedLearner):
+    """Seconds that the weights of a model of an object took to learn; 0 without any, which the model itself tells."""
+    if model not in learners():
         return 0.0
     try:
-        return float(learns.cost(scene, object))
+        return float(learners()[model].cost(scene, object))
     except ValueError:
         return 0.0

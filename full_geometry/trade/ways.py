@@ -9,13 +9,14 @@ from typing import Any
 
 import mitsuba as mi
 
+from full_geometry.capabilities import AUTO
 from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.integrators.gathering import Gathering
 from full_geometry.objects.objects import KnowsUnit, millimetres, refuse_instances, translucent_shapes
 from full_geometry.objects.small_emitters import is_delta
-from full_geometry.registry import AUTO, model_names
 from full_geometry.scenes.scene_files import PATH_TRACED, load_objects
 from full_geometry.trade.soft_light import SoftLight
+from full_geometry.transport.models import model_names
 from halfspace_sss.checks import check_choice
 from halfspace_sss.interface.model import model_class, models
 
@@ -158,7 +159,6 @@ class Stage:
             else:
                 plugin = {"type": "bssrdf", **self.settings, **self.bssrdf, "model": way.model, "light": way.light}
                 plugin |= {"orders": way.orders} if way.orders else {}
-                plugin["train_seconds"] = 0.0  # who asks does not wait for the training of an object
             self._integrators[way] = mi.load_dict(plugin)
             if way.part:
                 self._integrators[way].gathering = Gathering(way.part)

@@ -7,7 +7,9 @@ calibration of the whole, and the weights that come with the package.
 from __future__ import annotations
 
 import functools
+import math
 import os
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
@@ -18,8 +20,18 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.geometry.points import SurfacePoint, evaluate, opaque, refract_in
-from full_geometry.objects.objects import TranslucentObject
+from full_geometry.geometry.points import (
+    ObjectModel,
+    PositionSampler,
+    RadialTable,
+    SurfacePoint,
+    evaluate,
+    opaque,
+    refract_in,
+)
+from full_geometry.geometry.shape import Geometry
+from full_geometry.objects.objects import TranslucentObject, check_geometry
+from full_geometry.settings import Settings
 from full_geometry.transport.descriptors import (
     CURVED_OWN,
     CURVED_SHARED,
@@ -39,6 +51,7 @@ from full_geometry.transport.descriptors import (
 )
 from full_geometry.transport.exit_pairs import EntryProposals, trace_exits, trace_scores
 from full_geometry.transport.features import Side
+from full_geometry.transport.half_space import HalfSpaceProposals, area_share
 from full_geometry.transport.one_object import HalfSpace
 from halfspace_sss.interface.model import BSSRDF, bssrdf
 from halfspace_sss.lazy import once
@@ -422,3 +435,48 @@ def transport(obj: TranslucentObject, path: str | os.PathLike | None = None) -> 
         raise ValueError(f"the medium of {name!r} must be the same everywhere for {KIND}, got one that varies")
     model = NeuralShape.of(obj, load(Path(path) if path is not None else shipped_weights()))
     return replace(calibrated(model), checksums=checksums(obj, path))
+
+
+# ---- Its binding to an object: entries by probes and over the area, and warnings out of range -------
+
+SLACK = 1e-3  # of the bounds, for rounding
+
+
+def warn_out_of_range(geometry: Geometry, media: tuple[Medium, ...]) -> None:
+    """Warn, by name and number, of what the network was not trained on: size, medium, or an object that is open."""
+    name, reasons = geometry.shape.id(), []
+    scattering = [m for m in media if float(m.sigma_s) > 0]
+    numbers = {
+        "sigma_t sqrt(area)": (SIZE, [float(m.sigma_t) * math.sqrt(geometry.area) for m in scattering]),
+        "reduced albedo": (ALBEDO, [float(m.albedo_prime) for m in scattering]),
+        "g": (G, [float(m.g) for m in scattering]),
+        "eta": (ETA, [float(m.eta) for m in scattering]),
+    }
+    for what, ((low, high), values) in numbers.items():
+        outside = [v for v in values if not low - SLACK * abs(low) <= v <= high + SLACK * abs(high)]
+        if outside:
+            reasons.append(f"{what} {', '.join(f'{v:.4g}' for v in outside)} is not in [{low:g}, {high:g}]")
+    if not geometry.closed:
+        reasons.append("it is not closed")
+    if reasons:
+        warnings.warn(
+            f"object {name!r} is out of the range that neural_shape was trained on: {'; '.join(reasons)}", stacklevel=2
+        )
+
+
+def shape_model(obj: TranslucentObject, settings: Settings) -> ObjectModel:
+    """Transport and proposals of any object with a homogeneous medium and a smooth boundary.
+
+    Raises:
+        ValueError: the medium varies or is out of the range of `neural`, or normals of pieces of the object disagree.
+    """
+    geometry = obj.geometry
+    check_geometry(geometry)
+    warn_out_of_range(geometry, obj.media)
+    model = transport(obj)
+    live = [m for m in model.half_space.models if float(m.medium.sigma_s) > 0]
+    table = RadialTable(live, geometry.size)
+    share = area_share(geometry, table.mean / geometry.size, settings.area_share)
+    # light may leave by another piece of the surface than it entered by
+    positions = PositionSampler(replace(geometry, pieces=None), table, obj.points, share)
+    return ObjectModel(model, HalfSpaceProposals(positions, live[0]))

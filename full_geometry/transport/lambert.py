@@ -108,6 +108,3 @@ def lambert_model(obj: TranslucentObject, settings: Settings) -> ObjectModel:
         transport = TexturedLambertTransport.of([m.g for m in obj.media], obj.media[0].eta)
         return ObjectModel(transport, LambertProposals())
     return ObjectModel(LambertTransport([float(m.reflectance()) for m in obj.media]), LambertProposals())
-
-
-lambert_model.takes_textures = True

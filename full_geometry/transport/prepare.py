@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.capabilities import AUTO, Capabilities, Choices
 from full_geometry.geometry.instances import (
     InstanceScene,
     shown_groups,
@@ -38,17 +39,17 @@ from full_geometry.objects.objects import (
     translucent_shapes,
     with_inclusions,
 )
-from full_geometry.registry import AUTO, Choices, choices, lookup
 from full_geometry.settings import AUTOMATIC, Settings
 from full_geometry.surface.medium_derivatives import DifferentiableTransport, MediumDerivatives
 from full_geometry.surface.translucent import MediumSpec, check_boundary
 from full_geometry.surface.varying import equivalent, warn_of_means
 from full_geometry.surface.wrapped import surface_of
 from full_geometry.transport.half_space import check_turns, half_space_model
+from full_geometry.transport.models import check_model, lookup, model_names
 from full_geometry.transport.palette import palette_model
 
-LAMBERT = "lambert"
 RIGID = 1e-3  # of lengths, by which instances of what is learnt may differ
+Chooser = Callable[[Any, Settings], Choices]  # says what stands for "auto" in a scene
 
 
 def _check_repeated(geometry: Geometry, spec: MediumSpec, settings: Settings) -> None:
@@ -57,8 +58,8 @@ def _check_repeated(geometry: Geometry, spec: MediumSpec, settings: Settings) ->
         raise ValueError(f"the medium of an instance must not vary in space, got that of object {geometry.name}")
     if settings.light == "gathered":
         raise ValueError(f"light must be sampled of objects that instances show, got gathered of {geometry.name}")
-    of_object = spec.orders != "single" and lookup(spec.model).transport
-    if of_object and spec.model != LAMBERT and geometry.group.stretch > RIGID:
+    stretched = geometry.group.stretch > RIGID
+    if spec.orders != "single" and stretched and not lookup(spec.model).capabilities.stretched:
         raise ValueError(
             f"instances of object {geometry.name} must be moved, turned or mirrored for the model {spec.model!r}, "
             f"got lengths that differ by {100 * geometry.group.stretch:.3g} %: give each size a group of its own, or "
@@ -73,7 +74,7 @@ def _asked(shape: Any, settings: Settings, model: str | None = None) -> MediumSp
     return spec if asked == {key: getattr(spec, key) for key in asked} else replace(spec, **asked)
 
 
-def _choices(scene: Any, settings: Settings) -> Choices:
+def choices_of(scene: Any, settings: Settings, choose: Chooser) -> Choices:
     """What stands for "auto", measured if anything is."""
     specs = [_asked(shape, settings) for shape in translucent_shapes(scene)]
     if specs and (settings.light == AUTO or any(spec.model == AUTO for spec in specs)):
@@ -81,7 +82,7 @@ def _choices(scene: Any, settings: Settings) -> Choices:
             raise ValueError("model must be named under a spectral variant, got 'auto'")
         for shape in outermost(scene):
             check_boundary(name_of(shape), surface_of(shape).boundary)
-        return choices(scene, settings)
+        return choose(scene, settings)
     return Choices({}, settings.light, {})
 
 
@@ -102,8 +103,9 @@ def _make_object(geometry: Geometry, spec: MediumSpec, settings: Settings) -> Tr
     obj.wrapping.check(geometry)
     if geometry.inclusions is not None:
         _check_takes(geometry, spec, single_only)
-    derivatives = MediumDerivatives(obj.surface, settings.mm_per_unit, spec.model)
-    if spec.orders == "total" and not single_only and (lookup(spec.model).of_half_space or spec.model == LAMBERT):
+    capabilities = lookup(spec.model).capabilities
+    derivatives = MediumDerivatives(obj.surface, settings.mm_per_unit, spec.model, capabilities.derivatives)
+    if spec.orders == "total" and not single_only and not capabilities.straight:
         check_turns(geometry, media, spec.model)
     none = ObjectModel(None, None)
     transport, proposals, entries = none if single_only else _model_of(obj, spec, settings)
@@ -114,13 +116,13 @@ def _make_object(geometry: Geometry, spec: MediumSpec, settings: Settings) -> Tr
     entries = entries if settings.entries == AUTOMATIC else settings.entries
     return replace(
         obj, transport=transport, proposals=proposals, entries=entries, low_orders=low_orders,
-        expected=expected_of(media), derivatives=derivatives,
+        expected=expected_of(media), derivatives=derivatives, capabilities=capabilities,
     )  # fmt: skip
 
 
 def _check_takes(geometry: Geometry, spec: MediumSpec, single_only: bool) -> None:
     """ValueError if a model does not take what lies inside its object, or some orders only are asked for."""
-    if single_only or not lookup(spec.model).takes_contents:
+    if single_only or not lookup(spec.model).capabilities.inclusions:
         refuse(geometry.inclusions.found[0], geometry, f"the model {spec.model!r}")
     if spec.orders != "total":
         raise ValueError(
@@ -137,25 +139,14 @@ def _low_orders(spec: MediumSpec, transport: Transport | None) -> tuple[int, ...
         return (1,) if spec.orders == "single" else ()
     if transport is not None and transport.orders == "total":
         return ()
-    return (0, 1) if transport is None or lookup(spec.model).knows_objects else (1,)
+    return (0, 1) if transport is None or lookup(spec.model).capabilities.straight else (1,)
 
 
 def _model_of(obj: TranslucentObject, spec: MediumSpec, settings: Settings) -> ObjectModel:
-    of_object = lookup(spec.model).transport
-    if of_object is not None:
-        if obj.spectral is not None:
-            raise ValueError(
-                f"variant must be RGB or mono for the model {spec.model!r} of object {obj.geometry.name}, got "
-                f"{mi.variant()}: translucent_walk and models of the half-space take spectra"
-            )
-        if obj.textured is not None and not getattr(of_object, "takes_textures", False):
-            refuse_textures(obj.geometry.name, f"the model {spec.model!r}")
-        if obj.wrapping.bend is not None and lookup(spec.model).learner is not None:
-            raise ValueError(
-                f"object {obj.geometry.name} must be without normal and bump maps for the model {spec.model!r}: "
-                "translucent_walk and models of the half-space take them"
-            )
-        return of_object(obj, settings)
+    entry = lookup(spec.model)
+    if not entry.capabilities.of_half_space:
+        _check_object(obj, spec.model, entry.capabilities)
+        return entry.transport(obj, settings)
     if obj.textured is not None:
         return palette_model(spec.model, obj.geometry, obj.media, obj.textured, settings)
     if obj.spectral is not None:
@@ -165,15 +156,36 @@ def _model_of(obj: TranslucentObject, spec: MediumSpec, settings: Settings) -> O
     return half_space_model(spec.model, obj.geometry, obj.media, settings)
 
 
-class TranslucentObjects:
-    """The objects of the scene that was asked for last, made anew when its objects, their shape or media changed."""
+def _check_object(obj: TranslucentObject, model: str, takes: Capabilities) -> None:
+    """ValueError if an object has a spectrum, a texture or a map of normals that its model does not take."""
+    if obj.spectral is not None and not takes.spectra:
+        raise ValueError(
+            f"variant must be RGB or mono for the model {model!r} of object {obj.geometry.name}, got "
+            f"{mi.variant()}: translucent_walk and models of the half-space take spectra"
+        )
+    if obj.textured is not None and not takes.textures:
+        refuse_textures(obj.geometry.name, f"the model {model!r}")
+    if obj.wrapping.bend is not None and not takes.normal_maps:
+        raise ValueError(
+            f"object {obj.geometry.name} must be without normal and bump maps for the model {model!r}: "
+            "translucent_walk and models of the half-space take them"
+        )
 
-    def __init__(self, settings: Settings) -> None:
-        self.settings = settings
+
+class TranslucentObjects:
+    """The objects of the scene that was asked for last, made anew when its objects, their shape or media changed.
+
+    Args:
+        settings: of the integrator.
+        choose: says what stands for "auto".
+    """
+
+    def __init__(self, settings: Settings, choose: Chooser) -> None:
+        self.settings, self.choose = settings, choose
         self._made: tuple[SceneMark | None, list, list[TranslucentObject]] = (None, [], [])
         self._places: list = []
         if settings.model:
-            lookup(settings.model)
+            check_model(settings.model, model_names())
         self.choices = Choices({}, settings.light, {})  # for as long as the objects are the same
 
     def take_over(self, other: TranslucentObjects) -> None:
@@ -193,22 +205,22 @@ class TranslucentObjects:
             current = current and not objects[0].instance_scene.shapes
         if not current:
             if not (objects and same):
-                self.choices = _choices(scene, self.settings)
-            self._made = mark, shapes, make_objects(scene, self.settings, (), self.choices)
+                self.choices = choices_of(scene, self.settings, self.choose)
+            self._made = mark, shapes, make_objects(scene, self.settings, self.choices)
         self._places = places
         return self._made[2]
 
 
 def make_objects(
-    scene: Any, settings: Settings, without: Collection[str] = (), chosen: Choices | None = None
+    scene: Any, settings: Settings, chosen: Choices | None = None, without: Collection[str] = ()
 ) -> list[TranslucentObject]:
     """All objects of a scene that have a `translucent` surface, but for those in others or with the ids in `without`.
 
     Args:
         scene: of Mitsuba.
         settings: of the integrator.
+        chosen: what stands for "auto"; may be left out where no object has that model.
         without: ids.
-        chosen: what stands for "auto", by default chosen now.
 
     Raises:
         ValueError: there is none, a camera or a lamp is inside one, a model refuses its medium or what lies inside, or
@@ -224,8 +236,7 @@ def make_objects(
     check_sensors(scene, objects)
     outer = with_inclusions(scene, objects, settings.mm_per_unit, _MODELS)
     check_together(scene, [part.scene for each in outer for part in (each, each.inclusions) if part is not None])
-    chosen = chosen or _choices(scene, settings)
-    models = {id(shape): chosen.models.get(k) for k, shape in enumerate(shapes)}
+    models = {id(shape): chosen.models.get(k) if chosen else None for k, shape in enumerate(shapes)}
     named = [each for each in outer if each.shape.id() not in without]
     specs = [_asked(each.shape, settings, models[id(each.shape)]) for each in named]
     for each, spec in zip(named, specs):

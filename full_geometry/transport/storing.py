@@ -351,8 +351,8 @@ def find_weights(obj: TranslucentObject, folder: str | os.PathLike | None = None
             reasons.append(f"{path.name}: {error}")
     why = f" ({'; '.join(reasons)})" if reasons else ""
     raise ValueError(
-        f"object {obj.geometry.name} must be trained for {KIND}, got one that is not in {place}{why}; "
-        "`halfspace-sss train object --scene` does it"
+        f"object {obj.geometry.name} must be trained for {KIND}, got one that is not in {place}{why}: "
+        f"`halfspace-sss train object --scene SCENE.xml --object {obj.geometry.shape.id()}` trains it"
     )
 
 

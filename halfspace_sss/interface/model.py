@@ -16,8 +16,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from halfspace_sss.arrays import broadcast_query, is_torch
-from halfspace_sss.checks import check_choice, check_query
-from halfspace_sss.extensions import FAILURES, MODELS, TRANSPORTS, offered, offers, warn_left_out
+from halfspace_sss.checks import check_query, did_you_mean
+from halfspace_sss.extensions import FAILURES, MODELS, offered, warn_left_out
 from halfspace_sss.lazy import once
 from halfspace_sss.physics.fresnel import C_phi, F_t, mu_internal, sine
 from halfspace_sss.physics.layers import Layers
@@ -464,12 +464,9 @@ def model_class(name: str) -> type[BSSRDF]:
     """The class of a model; ValueError with the nearest name if there is none."""
     check_allowed(name)
     known = {**_installed(), **_registered}
-    if name not in known and name in offers(TRANSPORTS):
-        raise ValueError(
-            f"model must be one of the half-space here, got {name!r}, which is one of objects in a scene: "
-            "`halfspace-sss errors object` and `render` take it"
-        )
-    check_choice("model", name, known)
+    if name not in known:
+        hint = did_you_mean(name, list(known)) + "; `render` and `errors object` take models of objects"
+        raise ValueError(f"model must be one of {', '.join(known)}, got {name!r}{hint}")
     return known[name]
 
 

@@ -59,7 +59,7 @@ def test_models_have_one_option_in_all_commands() -> None:
 
 
 def test_a_model_of_objects_is_named_as_one_where_half_spaces_are_asked_for() -> None:
-    with pytest.raises(ValueError, match="got 'neural_shape', which is one of objects in a scene"):
+    with pytest.raises(ValueError, match="got 'neural_shape'.*`render` and .* take models of objects"):
         sss.curves(MEDIUM, models=["neural_shape"])
 
 

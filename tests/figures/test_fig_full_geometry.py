@@ -146,7 +146,6 @@ def test_weights_of_another_training_are_not_found(small: None, tmp_path: Path) 
 
     scenes.prepare()
     scene = scenes.bunny_scene("ketchup", 8)
-    scene["integrator"]["train_seconds"] = 0.0
     with learnt.with_weights(tmp_path, {}), pytest.raises(ValueError, match="must be trained for full_geometry"):
         load_scene(scene, MODEL)
 

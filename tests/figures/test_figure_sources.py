@@ -16,7 +16,7 @@ import pytest
 import figures
 from figures.computing.contenders import long_walk
 from figures.parts.part import PACKAGES, Task, modules_of, unmodelled
-from full_geometry.registry import lookup
+from full_geometry.transport.models import lookup
 from halfspace_sss.interface.model import model_class
 
 ROOT = Path(figures.__file__).resolve().parent.parent
@@ -52,9 +52,9 @@ EDITS = {
     "dipole": [("analytic_models/better_dipole.py", EDIT)],
     "dipoles": [("analytic_models/_diffusion.py", EDIT)],
     "network": [("halfspace_sss/neural/universal.py", EDIT)],
-    "full geometry": [("full_geometry/scene.py", "\nENTRIES, FINE = 3, 9.5\n")],
-    "shapes": [("full_geometry/models/neural_shape.py", EDIT)],
-    "learner": [("full_geometry/learning/fitting.py", EDIT)],
+    "full geometry": [("full_geometry/transport/learnt.py", "\nENTRIES, FINE = 3, 9.5\n")],
+    "shapes": [("full_geometry/transport/any_shape.py", EDIT)],
+    "learner": [("full_geometry/learning/network_fitting.py", EDIT)],
     "lambert": [("full_geometry/transport/lambert.py", EDIT)],
     "choice": [("full_geometry/trade/automatic.py", EDIT)],
     "far": [("halfspace_sss/physics/fresnel.py", EDIT)],
@@ -144,4 +144,4 @@ def test_path_tracing_finds_no_model(tmp_path: Path) -> None:
 
 
 def test_a_name_that_a_package_imports_late_counts_with_its_module() -> None:
-    assert "full_geometry.scenes.plugins" in modules_of(["figures.computing.scenes"])
+    assert "full_geometry.plugins" in modules_of(["figures.computing.scenes"])

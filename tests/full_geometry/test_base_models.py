@@ -14,7 +14,6 @@ pytest.importorskip("torch")
 
 from full_geometry.geometry.points import SurfacePoint  # noqa: E402
 from full_geometry.learning import training  # noqa: E402
-from full_geometry.learning.learnt import learnt_model  # noqa: E402
 from full_geometry.learning.model_errors import (  # noqa: E402
     LIGHTS,
     measure,
@@ -27,6 +26,7 @@ from full_geometry.settings import Settings  # noqa: E402
 from full_geometry.transport import any_shape as shapes  # noqa: E402
 from full_geometry.transport import storing  # noqa: E402
 from full_geometry.transport.exit_pairs import EntryProposals  # noqa: E402
+from full_geometry.transport.learnt import learnt_model  # noqa: E402
 from full_geometry.transport.one_object import HalfSpace  # noqa: E402
 from halfspace_sss import Medium  # noqa: E402
 from halfspace_sss.neural import store as known_weights  # noqa: E402

@@ -286,7 +286,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 def untrainable(inside: dict, **more: Any) -> mi.Scene:
-    return mi.load_dict(scene(inside, train_seconds=0.0, **more))
+    return mi.load_dict(scene(inside, **more))
 
 
 @pytest.mark.slow

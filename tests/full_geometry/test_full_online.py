@@ -8,6 +8,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -24,11 +25,11 @@ import drjit as dr  # noqa: E402
 import full_geometry  # noqa: E402
 from figures import app as cli  # noqa: E402
 from full_geometry.geometry.points import SurfacePoint  # noqa: E402
-from full_geometry.learning import training  # noqa: E402
+from full_geometry.learning import online, training  # noqa: E402
 from full_geometry.learning.network_fitting import Recipe  # noqa: E402
 from full_geometry.learning.training import CameraSchedule  # noqa: E402
 from full_geometry.objects.objects import object_of  # noqa: E402
-from full_geometry.scenes import camera_walks, online, reference  # noqa: E402
+from full_geometry.scenes import camera_walks, reference  # noqa: E402
 from full_geometry.scenes.combined import combined  # noqa: E402
 from full_geometry.scenes.reference_store import Reference  # noqa: E402
 from full_geometry.scenes.scene_files import open_scene  # noqa: E402
@@ -90,8 +91,8 @@ def finished(whole: Path, tmp_path: Path) -> None:
     shutil.copytree(whole, tmp_path, dirs_exist_ok=True)
 
 
-def _render(*arguments: str, file: str = "ball.xml") -> Any:
-    return CliRunner().invoke(cli.app, ["render", file, "--spp", "8", *arguments])
+def _render(*arguments: str, file: str = "ball.xml", seconds: str = "60") -> Any:
+    return CliRunner().invoke(cli.app, ["render", file, "--spp", "8", "--train-seconds", seconds, *arguments])
 
 
 def _weights() -> list[Path]:
@@ -195,7 +196,8 @@ def _refused(monkeypatch: Any, message: str, result: Any) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "arguments", "message"),
     [
-        ("", "", ["--train-seconds", "0"], "object 'ball' must be trained for full_geometry"),
+        ("", "", ["--train-seconds", "0"],
+         "`halfspace-sss train object --scene SCENE.xml --object ball` trains it"),
         ("", "", ["--train-seconds", "-1"], "train_seconds must be a number in [0, 1e+07], got -1.0"),
         ("", "", ["--train-error", "0"], "train_error must be a number in [0.0001, 1], got 0.0"),
         ("</bsdf>", '<bsdf type="roughdielectric"><float name="int_ior" value="1.3"/><float name="ext_ior" value="1"/>'
@@ -243,11 +245,18 @@ def test_an_object_with_a_model_of_the_half_space_keeps_walks_out_of_the_image()
     assert result.exit_code == 0 and "cannot join the image" in result.stderr and not WALKS.exists() and _weights()
 
 
-def test_mitsubas_own_render_learns_with_a_warning() -> None:
-    scene = open_scene("ball.xml")
-    with pytest.warns(UserWarning, match="object 'ball' has no weights: it is learnt first"):
-        image = np.array(mi.render(scene, spp=4))
-    assert image[..., :3].max() > 0 and _weights()
+@pytest.mark.parametrize("render", [lambda scene: mi.render(scene, spp=4), lambda scene: _render(seconds="0")])
+def test_a_render_starts_no_training(render: Any, monkeypatch: Any) -> None:
+    monkeypatch.setattr(training, "train", None)
+    monkeypatch.setattr(training, "_ObjectTraining", None)
+    monkeypatch.setattr(camera_walks.CameraWalks, "exits", None)
+    command = "must be trained for full_geometry.*`halfspace-sss train object --scene SCENE.xml --object ball`"
+    try:
+        told = render(open_scene("ball.xml")).stderr
+    except RuntimeError as error:  # of `mi.render`
+        told = str(error)
+    assert re.search(command, told)
+    assert not Path("weights").exists()
 
 
 def test_first_exits_of_paths_from_the_camera_are_those_of_walks_from_where_they_enter(tmp_path: Path) -> None:
@@ -300,6 +309,6 @@ def test_the_combination_of_two_images_is_not_biased_and_has_less_variance_than_
 def test_the_library_function_renders_what_the_command_does(whole: Path) -> None:
     said: list[str] = []
     IMAGE.parent.mkdir()
-    online.render("ball.xml", IMAGE, spp=8, told=said.append)
+    online.render("ball.xml", IMAGE, train_seconds=60.0, spp=8, told=said.append)
     assert len(said) == 1
     _same_image(whole)

@@ -161,7 +161,7 @@ def test_another_object_beside_it_keeps_its_own_model(trained: Trained) -> None:
 def test_the_mirrored_object_is_another_one(trained: Trained) -> None:
     mirrored = {"bunny": bunny(mirror=True, bsdf=SURFACE)}
     with pytest.raises(ValueError, match="must be trained for full_geometry"):
-        load_scene(scene(mirrored, "full_geometry", train_seconds=0))
+        load_scene(scene(mirrored, "full_geometry"))
 
 
 def test_objects_with_the_same_surface_are_not_merged(tmp_path: Path) -> None:
@@ -176,7 +176,7 @@ def test_objects_with_the_same_surface_are_not_merged(tmp_path: Path) -> None:
 
 def test_objects_that_mitsuba_merged_are_refused_by_what_they_are(folder: Path) -> None:
     both = {name: bunny(bsdf=SURFACE) for name in ("one", "two")}
-    loaded = mi.load_dict(scene(both, "full_geometry", train_seconds=0))
+    loaded = mi.load_dict(scene(both, "full_geometry"))
     with pytest.raises(ValueError, match="object without an id .Mitsuba merges meshes that have the same surface"):
         loaded.integrator().prepare(loaded)
 
@@ -258,7 +258,7 @@ def test_weights_of_another_version_are_left_aside_by_name(trained: Trained, tmp
 @pytest.mark.slow
 def test_a_scene_of_another_unit_is_another_object(trained: Trained) -> None:
     with pytest.raises(ValueError, match="size_in_mfp of the medium"):
-        load_scene(scene({"bunny": bunny(bsdf=SURFACE)}, "full_geometry", mm_per_unit=1.1, train_seconds=0))
+        load_scene(scene({"bunny": bunny(bsdf=SURFACE)}, "full_geometry", mm_per_unit=1.1))
 
 
 # ---- Directional albedo under uniform illumination: its error, its file, its images ----------------
@@ -380,7 +380,7 @@ def test_an_even_sky_has_the_same_light_and_a_fifth_of_the_variance(trained: Tra
     film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
     surface = {"type": "translucent", **COLOURS, "model": "full_geometry"}
     scene = mi.load_dict({
-        "type": "scene", "integrator": {"type": "bssrdf", "train_seconds": 0.0}, "sky": {"type": "constant"},
+        "type": "scene", "integrator": {"type": "bssrdf"}, "sky": {"type": "constant"},
         "bunny": bunny(bsdf=surface), "sensor": {"type": "orthographic", "to_world": view, "film": film},
     })  # fmt: skip
     means, variances = [], []

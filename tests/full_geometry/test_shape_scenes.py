@@ -16,8 +16,8 @@ mi = pytest.importorskip("mitsuba")
 
 from figures import app as cli  # noqa: E402
 from full_geometry.learning import model_errors  # noqa: E402
-from full_geometry.registry import lookup, model_names  # noqa: E402
 from full_geometry.scenes.scene_files import load_scene  # noqa: E402
+from full_geometry.transport.models import lookup, model_names  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -58,7 +58,7 @@ def image(content: dict, model: str | None = None, spp: int = 256) -> np.ndarray
 
 
 def test_it_is_listed_with_the_transports() -> None:
-    assert "neural_shape" in model_names() and lookup("neural_shape").knows_objects
+    assert "neural_shape" in model_names() and not lookup("neural_shape").capabilities.of_half_space
 
 
 def test_a_render_of_an_object_that_nobody_trained_is_nearer_to_walks_than_the_half_space() -> None:

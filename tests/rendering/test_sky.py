@@ -6,6 +6,8 @@ The transport is of no medium: S mu_i = R mu_i / (pi A), so that alpha = R exact
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -16,8 +18,7 @@ from rendered import surface  # noqa: E402
 
 from full_geometry.geometry.points import ObjectModel  # noqa: E402
 from full_geometry.integrators.lighting import EnvironmentMean, Lights  # noqa: E402
-from full_geometry.registry import ModelEntry  # noqa: E402
-from full_geometry.transport import prepare  # noqa: E402
+from full_geometry.transport import models, prepare  # noqa: E402
 from full_geometry.transport.half_space import half_space_model  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -79,7 +80,7 @@ def scene(kind: type, patch: pytest.MonkeyPatch, light: dict, **integrator) -> d
         return ObjectModel(kind(obj.geometry.area), proposals, 2)
 
     patch.setattr(prepare, "_model_of", means)
-    patch.setattr(ModelEntry, "knows_objects", True)
+    patch.setattr(models, "HALF_SPACE", replace(models.HALF_SPACE, straight=True))
     film = {"type": "hdrfilm", "width": 12, "height": 12, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
     view = mi.ScalarTransform4f().look_at([0, 1, 5], [0, 0, 0], [0, 1, 0]).scale(0.6)
     return {

@@ -12,13 +12,13 @@ from render_files import XML
 from typer.testing import CliRunner
 
 from figures import app as cli
-from full_geometry.registry import model_names
 from full_geometry.trade import assess, flat, measuring, recommend, sampling
 from full_geometry.trade.assessing import assess_stage
 from full_geometry.trade.exits import visible_exits
 from full_geometry.trade.images import small_images
 from full_geometry.trade.sampling import first_sample, sample_more
 from full_geometry.trade.ways import Way, stage
+from full_geometry.transport.models import model_names
 from halfspace_sss import Medium
 from halfspace_sss.physics.fresnel import F_r
 

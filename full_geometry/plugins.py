@@ -1,13 +1,22 @@
-"""Registration of the plugins with Mitsuba, once for each variant."""
+"""Registration of the plugins with Mitsuba, once for each variant, with what they need of the rooms above them."""
 
 from __future__ import annotations
 
+import importlib
 import threading
+from typing import TYPE_CHECKING
 
 from full_geometry.scenes.scene_files import plainly
 from full_geometry.settings import VARIANTS, variant_channels
 from halfspace_sss.backend import BackendError, prepare_llvm, two_threads
 
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+    from full_geometry.capabilities import Choices
+    from full_geometry.settings import Settings
+
+TRADE = "full_geometry.trade.automatic"
 _active = False
 _lock = threading.Lock()
 
@@ -42,6 +51,11 @@ def _on_variant(old: str, new: str) -> None:
         _register_all()
 
 
+def _choose(scene: mi.Scene, settings: Settings) -> Choices:
+    """What stands for the model "auto"; the trade, which measures that, is named here and imported when it is asked."""
+    return importlib.import_module(TRADE).choose(scene, settings)
+
+
 def _register_all() -> None:
     import mitsuba as mi
 
@@ -52,7 +66,11 @@ def _register_all() -> None:
     from full_geometry.integrators.bssrdf import integrator_class
     from full_geometry.integrators.translucent_walk import walk_integrator_class
     from full_geometry.surface.translucent import translucent_class
+    from full_geometry.transport.models import check_model, model_names
 
-    mi.register_bsdf("translucent", translucent_class())
-    mi.register_integrator("bssrdf", integrator_class())
+    def check(model: str) -> None:
+        check_model(model, model_names())
+
+    mi.register_bsdf("translucent", lambda props: translucent_class()(props, check))
+    mi.register_integrator("bssrdf", lambda props: integrator_class()(props, _choose))
     mi.register_integrator("translucent_walk", walk_integrator_class())

@@ -1,6 +1,6 @@
-"""Renders of scenes with objects that have to be learnt first: walks until they are, and both in one image.
+"""Renders of scenes whose objects are trained first: walks until they are, and both in one image.
 
-    online.render("scene.xml", "image.exr", spp=256)
+    online.render("scene.xml", "image.exr", train_seconds=60, spp=256)
 
 Walks from the camera, exact and with light of all orders, make an image, and where they leave the object is what its
 model is learnt from, beside walks from random points. Once the error of the model is small enough, or the time for
@@ -18,19 +18,21 @@ from pathlib import Path
 from typing import Any
 
 from full_geometry.integrators.bssrdf import is_bssrdf
+from full_geometry.learning.learners import learner, learners
+from full_geometry.learning.records import LearntObject
 from full_geometry.objects.objects import outermost, translucent_shapes
 from full_geometry.scenes import reference
 from full_geometry.scenes.camera_walks import CameraWalks
 from full_geometry.scenes.combined import combined
-from full_geometry.scenes.learners import LearntObject, learner, learners
 from full_geometry.scenes.reference_store import Reference, load, save
 from full_geometry.surface.wrapped import surface_of, wrapping_of
-from halfspace_sss.checks import check_count
+from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.neural.store import weights_folder
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import check_folder
 
 TRAINING = "training"
+TRAIN_ERROR = 0.03
 
 
 def files(path: Path) -> dict[str, Path]:
@@ -39,12 +41,12 @@ def files(path: Path) -> dict[str, Path]:
 
 
 def untrained(scene: Any) -> dict[str, list[str]]:
-    """Ids of the objects that are learnt before the scene is rendered, by the name of their model.
+    """Ids of the objects that have to be trained before the scene can be rendered, by the name of their model.
 
     Raises:
         ValueError: one cannot be learnt, or there is no place for its weights.
     """
-    if not is_bssrdf(scene.integrator()) or scene.integrator().settings.train_seconds == 0:
+    if not is_bssrdf(scene.integrator()):
         return {}
     specs = [surface_of(shape).spec for shape in translucent_shapes(scene)]
     names, known, results = sorted({spec.model for spec in specs}), learners(), {}
@@ -58,6 +60,8 @@ def render(
     scene: Any,
     path: str | os.PathLike,
     *,
+    train_seconds: float,
+    train_error: float = TRAIN_ERROR,
     sensor: int = 0,
     seed: int = 0,
     resume: bool | str | os.PathLike = True,
@@ -69,14 +73,15 @@ def render(
 ) -> Reference:
     """`reference.render`, before which objects without weights are learnt from walks that join the image.
 
-    The limits are those of the model's image; what walks have traced comes on top. How long an object may be learnt,
-    and up to which error, the integrator says (`train_seconds`, `train_error`). Walks join the image if every
+    The limits are those of the model's image; what walks have traced comes on top. Walks join the image if every
     translucent object of the scene has a model that is learnt: others are to look as their models have it. A run that
     was killed and goes on ends with the same weights and the same image.
 
     Args:
         scene: a dict, the path of an XML file, or a Mitsuba scene.
         path: of the EXR file; while it is made, the parts are beside it, see `files`.
+        train_seconds: time for each object whose model has to be trained; 0 refuses objects without weights.
+        train_error: relative error under constant light, measured on the way, from which on it has learnt enough.
         sensor: number of the sensor.
         seed: of walks, learning and render.
         resume: True goes on with what is at `path`, False begins anew, another path goes on with what is there.
@@ -94,6 +99,8 @@ def render(
     """
     path = Path(path)
     check_count("seed", seed, 0)
+    check_interval("train_seconds", train_seconds, 0.0, 1e7)
+    check_interval("train_error", train_error, 1e-4, 1.0)
     reference.Limits(*(limits.get(name) for name in ("spp", "passes", "target_error", "seconds")))
     check_folder(path.parent)
     scene, integrator = reference.loaded(scene, None, sensor)
@@ -103,7 +110,7 @@ def render(
         _forget(parts)
     elif base != path:
         _fetch(files(base), parts)
-    names = untrained(scene)
+    names = untrained(scene) if train_seconds > 0 else {}
     how = {"sensor": sensor, "seed": seed, "progress": progress, **limits}
     if not names and not parts["walks.exr"].exists():
         if is_bssrdf(integrator):
@@ -115,7 +122,8 @@ def render(
     if names:
         walks.check()
         integrator.check(scene, [name for ids in names.values() for name in ids])
-    records = _learnt(scene, walks, seed, parts["training"], learning, told or (lambda sentence: None))
+    enough = {"seconds": train_seconds, "target_error": train_error, "seed": seed}
+    records = _learnt(scene, walks, enough, parts["training"], learning, told or (lambda sentence: None))
     integrator.prepare(scene)
     if walks.found is None:
         result = reference.render(scene, path, resume=resume, **how)
@@ -130,18 +138,19 @@ def render(
 
 
 def _learnt(
-    scene: Any, walks: CameraWalks, seed: int, work: Path, learning: NamedProgress | None, told: Callable[[str], None]
-) -> list[dict[str, Any]]:
+    scene: Any, walks: CameraWalks, enough: dict[str, Any], work: Path, learning: NamedProgress | None,
+    told: Callable[[str], None],
+) -> list[dict[str, Any]]:  # fmt: skip
     """Learn one object after the other; those of the same mesh and medium share what was learnt."""
-    settings, camera, records = scene.integrator().settings, walks if _join(scene) else None, []
-    while names := untrained(scene):
+    camera, records = walks if _join(scene) else None, []
+    while enough["seconds"] > 0 and (names := untrained(scene)):
         model, (name, *_) = next(iter(names.items()))
         if any(name == record["object"] for record in records):
             raise ValueError(f"weights of object {name!r} must be found once they are written, got none")
-        told(_sentence(name, model, settings, camera is not None))
+        told(_sentence(name, model, enough, camera is not None))
         result = learner(model).train(
-            scene, object=name, seconds=settings.train_seconds, target_error=settings.train_error, seed=seed,
-            folder=None, work=work / f"{zlib.crc32(name.encode()):08x}", progress=learning, camera=camera,
+            scene, object=name, **enough, folder=None, work=work / f"{zlib.crc32(name.encode()):08x}",
+            progress=learning, camera=camera,
         )  # fmt: skip
         records.append(_record(result, model))
         if walks.found is not None:
@@ -163,12 +172,12 @@ def _join(scene: Any) -> bool:
     return scene.integrator().settings.max_depth != 1 and learnt
 
 
-def _sentence(name: str, model: str, settings: Any, joined: bool) -> str:
+def _sentence(name: str, model: str, enough: dict[str, Any], joined: bool) -> str:
     use = "which join the image" if joined else "which cannot join the image"
     return (
-        f"object {name!r} has no weights of {model} yet: it is learnt for {settings.train_seconds:g} s, or until its "
-        f"error is below {100 * settings.train_error:g} %, from walks, {use}; then the model renders; weights are kept "
-        f"in {weights_folder()}"
+        f"object {name!r} has no weights of {model} yet: it is learnt for {enough['seconds']:g} s, or until its "
+        f"error is below {100 * enough['target_error']:g} %, from walks, {use}; then the model renders; weights are "
+        f"kept in {weights_folder()}"
     )
 
 
