@@ -180,7 +180,7 @@ def warn_of_means(spec: Any, obj: Geometry) -> None:
     """Warn that models of the half-space take the medium of `equivalent`, if it stands for one that varies."""
     if spec.varying is not None:
         warnings.warn(
-            f"object {obj.name} varies in space: models of the half-space take its mean sigma_s "
+            f"object {obj.name} varies in space: the model {spec.model!r} takes its mean sigma_s "
             f"{spec.medium.sigma_s} and sigma_a {spec.medium.sigma_a} 1/mm",
             stacklevel=2,
         )

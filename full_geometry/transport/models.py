@@ -69,7 +69,8 @@ class ModelEntry:
 
 
 HALF_SPACE = Capabilities(
-    of_half_space=True, textures=True, spectra=True, varying="mean", stretched=True, normal_maps=True, gathered=True,
+    of_half_space=True, orders="", textures=True, spectra=True, varying="mean", stretched=True, normal_maps=True,
+    gathered=True,
 )  # fmt: skip
 MODELS = {
     "full_geometry": ModelEntry(
@@ -85,6 +86,10 @@ MODELS = {
         Capabilities(straight=True, gathered=True, derivatives="neural"),
     ),
 }
+WALKS = Capabilities(  # what the integrator `translucent_walk` takes, which needs no model
+    orders="total", straight=True, textures=True, spectra=True, inclusions=True, varying="exact", stretched=True,
+    normal_maps=True, derivatives="all",
+)  # fmt: skip
 _others = once(lambda: offers(TRANSPORTS))
 
 

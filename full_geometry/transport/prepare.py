@@ -144,6 +144,8 @@ def _low_orders(spec: MediumSpec, transport: Transport | None) -> tuple[int, ...
 
 def _model_of(obj: TranslucentObject, spec: MediumSpec, settings: Settings) -> ObjectModel:
     entry = lookup(spec.model)
+    if entry.capabilities.varying == "mean":
+        warn_of_means(spec, obj.geometry)
     if not entry.capabilities.of_half_space:
         _check_object(obj, spec.model, entry.capabilities)
         return entry.transport(obj, settings)
@@ -152,7 +154,6 @@ def _model_of(obj: TranslucentObject, spec: MediumSpec, settings: Settings) -> O
     if obj.spectral is not None:
         of_mean = replace(obj.media[0], g=float(np.mean([m.g for m in obj.media])))
         return palette_model(spec.model, obj.geometry, (of_mean,) * len(obj.media), obj.spectral, settings)
-    warn_of_means(spec, obj.geometry)
     return half_space_model(spec.model, obj.geometry, obj.media, settings)
 
 
