@@ -19,6 +19,7 @@ from full_geometry.geometry.points import lifted, opaque, sided
 from full_geometry.geometry.rounding import ray_from
 from full_geometry.geometry.sensors import past_emitters, shows_sky
 from full_geometry.objects.small_emitters import NARROW, WIDE, SmallEmitters
+from full_geometry.precomputed.forward_scattering import ForwardRun
 from full_geometry.precomputed.unscattered_light import UnscatteredLight
 from full_geometry.walk.emission import emission, emitter_pdf, mis_weight, next_event, survival
 from full_geometry.walk.emitter_connections import (
@@ -65,6 +66,7 @@ class LightRecord:
     scattered: mi.Bool  # whether a vertex has scattered into a solid angle: delta lights then are no longer hidden
     precomputed: mi.Bool  # the ray's emission is in the unscattered light of the last event, or in the mirror image
     slopes: Score | tuple[()] = ()  # where derivatives are asked for, see `walk.scores`
+    run: ForwardRun | tuple[()] = ()  # where precomputed light has met forward events
 
 
 @dataclass
@@ -121,6 +123,10 @@ class LightVisitor:
         if self.unscattered is not None:
             counts = self.media.counts(walk.object, walk.order + 1)
             L = walk.weight * self.unscattered.light(self.media, event)
+            if self.forward:
+                share = dr.select(record.precomputed, record.run.onward(event.along).share, 1)
+                run = ForwardRun(share, mi.Vector3f(event.along), mi.Spectrum(event.m.g), mi.Bool(True))
+                record = replace(record, run=run)
             return walk, replace(record, L=record.L + dr.select(counts, L, 0), precomputed=mi.Bool(True))
 
         # ---- emitters behind boundaries of index 1
@@ -162,9 +168,20 @@ class LightVisitor:
     ) -> tuple[Walk, LightRecord]:
         if not self.media.any_rough:
             return walk, record
-        active = active & ~record.precomputed
-        light = self.sampled_emitter(walk, si, self.media.boundary(walk.object), active)
-        return walk, replace(record, L=record.L + light)
+        if self.forward:
+            record = replace(record, run=record.run.onward(-si.to_world(si.wi)))
+        left = self.left(record)
+        light = self.sampled_emitter(walk, si, self.media.boundary(walk.object), active & (dr.max(left) > 0))
+        return walk, replace(record, L=record.L + left * light)
+
+    @property
+    def forward(self) -> bool:
+        """Whether precomputed light has met forward events."""
+        return self.unscattered is not None and self.unscattered.forward
+
+    def left(self, record: LightRecord) -> mi.Spectrum:
+        """The share of the emission met next that is not precomputed."""
+        return dr.select(record.precomputed, record.run.share if self.forward else mi.Spectrum(0), mi.Spectrum(1))
 
     def surface(
         self, walk: Walk, record: LightRecord, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32
@@ -182,6 +199,8 @@ class LightVisitor:
     def crossing(self, walk: Walk, record: LightRecord, crossing: Crossing) -> tuple[Walk, LightRecord]:
         before = record
         record = replace(record, previous=crossing.si.p, pdf=crossing.pdf, delta=crossing.delta)
+        if self.forward:
+            record = replace(record, run=record.run.onward(crossing.along))
         if self.media.inner is not None:
             sampled = (self.media.index_of(crossing.si) < 0) & ~crossing.delta
             record = replace(record, delta=crossing.delta | ~crossing.leaves, scattered=record.scattered | sampled,
@@ -208,7 +227,8 @@ class LightVisitor:
         """Light of an emitter that the ray meets, weighted against sampling it from the last vertex."""
         # p_e of next-event estimation at the last vertex; 0 where that had but one direction
         emitter = si.emitter(self.scene)
-        active = active & (emitter != None) & ~record.precomputed  # noqa: E711
+        left = self.left(record)
+        active = active & (emitter != None) & (dr.max(left) > 0)  # noqa: E711
         previous, sampled = interaction_of(record.previous, walk.medium), active & ~record.delta
         pdf, ds = emitter_pdf(self.scene, previous, si, sampled)
         pdf = dr.select(sampled, pdf, 0)
@@ -226,7 +246,7 @@ class LightVisitor:
             directed = active & record.directed
             state = (which, record.departure, walk.medium, weight, directed)
             _, _, _, weight, _ = dr.if_stmt(state, directed, self._against_directions, lambda *state: state)
-        return walk.weight * emission(emitter, si, weight, active)
+        return walk.weight * left * emission(emitter, si, weight, active)
 
     def mirrored_emitter(
         self, walk: Walk, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool
@@ -253,7 +273,8 @@ class LightVisitor:
             return mi.Spectrum(0)
         n = self.small.n_delta
         which = mi.Int32(draw(n, walk.rng)) if n > 1 else dr.zeros(mi.Int32, dr.width(walk.o))
-        active = active & record.scattered & record.delta & ~record.precomputed
+        left = self.left(record)
+        active = active & record.scattered & record.delta & (dr.max(left) > 0)
         directed = mi.Bool(False)
         if self.connections is not None:
             w_0, _ = self.small.direction(which, walk.o)
@@ -268,7 +289,7 @@ class LightVisitor:
             state = (which, record.departure, walk.medium, mi.Float(1), directed)
             _, _, _, share, _ = dr.if_stmt(state, directed, self._against_directions, lambda *state: state)
             L = L * share
-        return dr.select(active, walk.weight * L * n, 0)
+        return dr.select(active, walk.weight * L * n * left, 0)
 
     def spread_inner_lights(self, walk: Walk, active: mi.Bool) -> mi.Spectrum:
         """Light of an inner light whose cone holds the ray, from a vertex that it was not sampled at."""
@@ -302,7 +323,7 @@ def _plus(record: LightRecord, walk: Walk, light: mi.Spectrum, slopes: Score | t
     return replace(record, L=record.L + walk.weight * light, slopes=slopes)
 
 
-def start_record(lanes: int, scored: bool = False) -> LightRecord:
+def start_record(lanes: int, scored: bool = False, forward: bool = False) -> LightRecord:
     """Of a path that begins at the camera."""
 
     def full(kind: type, value: float | bool | int) -> Any:
@@ -316,6 +337,7 @@ def start_record(lanes: int, scored: bool = False) -> LightRecord:
         departure=Departure(mi.Point3f(point), along, mi.Vector3f(along), full(mi.Int32, 0)),
         sighted=full(mi.Bool, False), scattered=full(mi.Bool, False),
         precomputed=full(mi.Bool, False), slopes=Score.sums(lanes) if scored else (),
+        run=ForwardRun.none(lanes) if forward else (),
     )  # fmt: skip
 
 
@@ -361,7 +383,7 @@ class PathTracer:
         total, step = (dr.opaque(mi.UInt32, v) for v in (n, lanes))  # kernels then serve images of any size
 
         def begin(index: mi.UInt32, rng: mi.PCG32) -> CameraPath:
-            path = _begin(rays, total, index, rng, media, bool(scores))
+            path = _begin(rays, total, index, rng, media, bool(scores), self.visitor.forward)
             return replace(path, emission=dr.zeros(mi.Spectrum, dr.width(index))) if self.layers else path
 
         def inside(p: CameraPath) -> CameraPath:
@@ -483,6 +505,8 @@ class PathTracer:
         light = replace(light, L=L, previous=dr.select(again, light.previous, si.p), sighted=again,
                         pdf=dr.select(again, light.pdf, bs.pdf), delta=delta & ~again, scattered=scattered,
                         precomputed=mirrors & ~enters)  # fmt: skip
+        if self.visitor.forward:
+            light = replace(light, run=replace(light.run, share=dr.select(mirrors & ~enters, 0, light.run.share)))
         if media.inner is not None:
             delta = ~again & (delta | enters | encloses)
             L = L + self.visitor.spread_inner_lights(walk, scattered & enters)
@@ -512,7 +536,13 @@ def _same(p: CameraPath) -> CameraPath:
 
 
 def _begin(
-    rays: mi.Ray3f, total: mi.UInt32, index: mi.UInt32, rng: mi.PCG32, media: WalkMedia, scored: bool = False
+    rays: mi.Ray3f,
+    total: mi.UInt32,
+    index: mi.UInt32,
+    rng: mi.PCG32,
+    media: WalkMedia,
+    scored: bool = False,
+    forward: bool = False,
 ) -> CameraPath:
     lanes, known = dr.width(index), index < total
     o, d = dr.gather(mi.Point3f, rays.o, index, known), dr.gather(mi.Vector3f, rays.d, index, known)
@@ -520,7 +550,7 @@ def _begin(
     wavelengths = dr.gather(mi.Spectrum, rays.wavelengths, index, known) if mi.is_spectral else ()
     walk = start_walk(o, d, rng, media.unknown(lanes, wavelengths))
     stay = Stay.none(lanes, media.textured) if scored else ()
-    return CameraPath(index, walk, start_record(lanes, scored), no, first, stay)
+    return CameraPath(index, walk, start_record(lanes, scored, forward), no, first, stay)
 
 
 # ---- First exits of paths from the camera ------------------------------------------------------------------------

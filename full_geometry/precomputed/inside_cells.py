@@ -133,6 +133,12 @@ class InsideCells:
         result[rows] = np.concatenate([value[:, :, None], slopes], axis=2)
         return result
 
+    def shared(self, values: np.ndarray) -> np.ndarray:
+        """(slots, ...) values, of each cell the sum over all that share its fit."""
+        result = values.copy()
+        result[self.cut] = _added(values[self.cut], self.place)[self.place]
+        return result
+
 
 def _inverse(C: np.ndarray) -> np.ndarray:
     """Of symmetric matrices (n, 3, 3), by cofactors: the same bits on every processor."""

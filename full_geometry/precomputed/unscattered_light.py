@@ -15,18 +15,19 @@ the transmittance, each channel in turn (balance heuristic), and added to the mo
 each cell is linear, by least squares over the part inside (`inside_cells`): it keeps the light of a cell and its first
 moments, so that its error in an image is of second order in the size of cells.
 
-Where a medium does not scatter evenly, the directions w' of the light of a cell count. They are parted by octants; the
-light of each is a lobe of Henyey-Greenstein about its mean direction w_m with the mean cosine a_m that it has, so that
+Directions of that light are held by its flux and second moments, of each cell and channel over its fluence phi:
 
-    ∫ p_g(w.w') L_0(x, w') dw' = phi(x) sum_m s_m p_(g a_m)(w.w_m),
+    f = ∫ L_0 w' dw' / phi,    M = ∫ L_0 w' w'^T dw' / phi,
+    ∫ p(w.w') L_0(x, w') dw' = phi(x) / (4 pi) (q_0 + 3 q_1 w.f + 5/2 q_2 (3 w^T M w - 1)).
 
-phi the fluence of unscattered light and s_m the share of the octant: two such functions of g and a convolve to one of
-g a. A single direction is exact.
+This is exact for phase functions of three Legendre coefficients q_l. Others are split (`forward_scattering`): L_0 then
+is light that has met forward events alone, and rays go on through those. Where a medium varies in space, rays cannot do
+that: phase functions are cut after q_2 = g² instead, and MOST_TRUNCATED bounds g.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import zip_longest
 from typing import Any
 
@@ -37,21 +38,20 @@ import numpy as np
 from full_geometry.geometry.instances import InstanceTransform, corners, ends_of
 from full_geometry.geometry.points import EntrySample, cosine_above, cosine_density, lift, opaque, sided
 from full_geometry.geometry.rounding import blocked, ray_from
+from full_geometry.precomputed.forward_scattering import kept_forward, quadratic_part, split_extinction, truncated
 from full_geometry.precomputed.inside_cells import POINTS, InsideCells, grid_edge
 from full_geometry.sampling.light_points import lattice, uniform_entries
 from full_geometry.walk.media import WalkMedia
-from full_geometry.walk.random_walk import Event, pick, sample_bsdf
-from halfspace_sss.physics.medium import eval_hg
+from full_geometry.walk.random_walk import Event, fly, free_path, pick, sample_bsdf, turn
 from halfspace_sss.tracing.walk import generator, pass_seed
 
-EDGE = 0.9  # of cells, mean free paths
+EDGE, FORWARD_EDGE = 0.9, 0.6  # of cells, mean free paths of the light in them
 MOST_EDGE = 1.5  # beyond, the mean of an image is more than .5 % off
 DEPTH = 12.0  # mean free paths below the surface: e^-12 is left of light there
 ALONG = 6  # points on a segment of a ray
 FEWEST_POINTS, MOST_POINTS = 2**14, 2**22  # of the surface, that find the cells it cuts
-OCTANTS = 8
 BY_COSINE = 0.25  # of the directions to emitters
-MOST_G = 0.85  # above, light reaches a fraction of the depth that walks do, and cells are too many
+MOST_TRUNCATED = 0.5  # abs(g) of media that vary or have textures, above which three coefficients are too few
 ROULETTE = 0.1  # part of its light below which a reflected ray may end
 R_4 = (0.8566748838545029, 0.7338918566271260, 0.6287067210378087, 0.5385972572236101)  # Roberts 2018, four dimensions
 
@@ -63,14 +63,17 @@ class UnscatteredLight:
     Args:
         slot: of the cells of all objects, one after the other.
         fluence: of each slot and channel the value at the centre and the slopes by units of h.
-        lobes: of each slot and octant s_m by channel, 0, a_m w_m, 0; None where all media scatter evenly.
+        directions: of each slot and channel f_x, f_y, f_z, M_xx, M_yy, M_xy, M_xz, M_yz; None where all media scatter
+            evenly.
         tables: by the number of an object, where its cells begin, their corner, 1/h and counts.
+        forward: whether it has met forward events, see `forward_scattering`.
     """
 
     slot: mi.Int32
     fluence: mi.Float
-    lobes: mi.Float | None
+    directions: mi.Float | None
     tables: dict[str, Any]
+    forward: bool
 
     def light(self, media: WalkMedia, event: Event) -> mi.Spectrum:
         """Unscattered light that an event of a walk scatters on along it, per weight of the walk."""
@@ -84,23 +87,21 @@ class UnscatteredLight:
         n = len(mi.Spectrum(0))
         rows = [dr.gather(mi.Vector4f, self.fluence, mi.UInt32(slot * n + c), held) for c in range(n)]
         phi = mi.Spectrum([v.x + v.y * y.x + v.z * y.y + v.w * y.z for v in rows])
-        if self.lobes is None:
+        if self.directions is None:
             return phi / (4 * dr.pi)
 
-        # ---- sum_m s_m p_(g a_m)(w.w_m)
-        g, total = event.m.g, mi.Spectrum(0)
-        for m in range(OCTANTS):
-            index = mi.UInt32(slot * OCTANTS + m) * 2
-            share, v = (dr.gather(mi.Vector4f, self.lobes, index + i, held) for i in range(2))
-            v = mi.Vector3f(v.x, v.y, v.z)
-            a = dr.norm(v)
-            cosine = dr.dot(event.along, v) / dr.maximum(a, 1e-6)
-            if media.same_g:
-                phase = [eval_hg(cosine, g[0] * a)] * n
-            else:
-                phase = [eval_hg(cosine, g[c] * a) for c in range(n)]
-            total += mi.Spectrum([share[c] * phase[c] for c in range(n)])
-        return phi * total
+        # ---- q_0 + 3 q_1 w.f + 5/2 q_2 (3 w^T M w - 1), w^T M w by the trace of 1
+        x, y, z = event.along.x, event.along.y, event.along.z
+        result = []
+        for c, g in enumerate(event.m.g):
+            index = mi.UInt32(slot * n + c) * 2
+            a, b = (dr.gather(mi.Vector4f, self.directions, index + i, held) for i in range(2))
+            squares = a.w * (x * x - z * z) + b.x * (y * y - z * z) + z * z
+            squares += 2 * (b.y * x * y + b.z * x * z + b.w * y * z)
+            q_0, q_1, q_2 = quadratic_part(g) if self.forward else truncated(g)
+            J = q_0 + 3 * q_1 * (a.x * x + a.y * y + a.z * z) + 2.5 * q_2 * (3 * squares - 1)
+            result.append(phi[c] * J / (4 * dr.pi))
+        return mi.Spectrum(result)
 
 
 def unscattered_light(
@@ -116,15 +117,15 @@ def unscattered_light(
         rays: of light, for each object.
     """
     directional = any(np.any(inside.medium.g) for inside in media.specs)
-    slots, values, lobes, first = [], [], [], 0
+    slots, values, angles, first = [], [], [], 0
     rows = {"first": [], "low": [], "scale": [], "counts": []}
     start = 0
     for k, grid in enumerate(cells):
-        D, octants = _moments(scene, media, k, grid, seed, rays, directional)
+        D, w = _moments(scene, media, k, grid, seed, rays, directional)
         slot = np.array(grid.slot)
         slots.append(np.where(slot >= 0, slot + start, -1))
         values.append(grid.fit(D / grid.h**3))
-        lobes.append(_lobes(octants, grid) if directional else [])
+        angles.append(_directions(w, D[:, :, :1], grid) if directional else [])
         for key, value in (("first", first), ("low", grid.low), ("scale", 1 / grid.h), ("counts", grid.counts)):
             rows[key].append(value)
         first, start = first + slot.size, start + grid.slots
@@ -132,24 +133,25 @@ def unscattered_light(
     tables = {key: kind(np.array(rows[key]).T) for key, kind in kinds.items()}
     slot, *arrays = (
         mi.Int32(np.concatenate(slots)),
-        *(mi.Float(np.concatenate(v).astype(np.float32).ravel()) for v in (values, lobes)),
+        *(mi.Float(np.concatenate(v).astype(np.float32).ravel()) for v in (values, angles)),
     )
     dr.make_opaque(tables, slot, arrays)
-    return UnscatteredLight(slot, arrays[0], arrays[1] if directional else None, tables)
+    return UnscatteredLight(slot, arrays[0], arrays[1] if directional else None, tables, forward(media))
 
 
-def _lobes(octants: np.ndarray, grid: InsideCells) -> np.ndarray:
-    """Shares of the light of octants, and their mean directions, shape (slots, octants, 8).
+def _directions(w: np.ndarray, light: np.ndarray, grid: InsideCells) -> np.ndarray:
+    """f and M of the light of cells, (slots, channels, 8), over that of the cells that share a fit.
 
     Args:
-        octants: (slots, octants, 8) light by channel, 0, light of all channels times direction, 0.
-        grid: tells the cells that share the light of another.
+        w: (slots, channels, 8) ∫ L_0 w dw dx, and likewise w_x², w_y², w_x w_y, w_x w_z, w_y w_z.
+        light: (slots, channels, 1) ∫ L_0 dw dx.
+        grid: tells the cells that share the fit of another.
     """
-    octants[grid.cut] = octants[grid.cut[grid.place]]
-    light, v = octants[..., :4], octants[..., 4:]
-    v /= np.maximum(light.sum(axis=-1, keepdims=True), 1e-30)
-    light /= np.maximum(light.sum(axis=1, keepdims=True), 1e-30)
-    return octants
+    w, light = (grid.shared(values) for values in (w, light))
+    result = w / np.maximum(light, 1e-30)
+    # where emitters have negative texels, moments are no longer those of a distribution
+    result[light[..., 0] <= 1e-30] = 0
+    return np.clip(result, -1, 1)
 
 
 def obstacle(media: WalkMedia) -> str:
@@ -159,7 +161,7 @@ def obstacle(media: WalkMedia) -> str:
     if media.inner is not None:
         return "something lies inside an object"
     for k, kind in enumerate(media.instance_table.kind):
-        h = _edges(media, k, EDGE)[1] * media.mm_per_unit * float(np.mean(media.specs[kind].medium.sigma_t))
+        h = _edges(media, k)[1] * float(np.mean(_extinction(media, kind)))
         if h > MOST_EDGE:
             return f"object {media.objects[kind].name} is so many mean free paths wide that cells have {h:.2g}"
     for obj, inside, around in zip_longest(media.objects, media.specs, media.wrappings):
@@ -171,18 +173,17 @@ def obstacle(media: WalkMedia) -> str:
             return f"the surface of object {obj.name} is masked, blended, or has a normal or bump map"
         if inside.orders != "total":
             return f"orders of object {obj.name} are {inside.orders!r}"
-        if np.max(np.abs(inside.medium.g)) > MOST_G:
-            return f"abs(g) of object {obj.name} is above {MOST_G}"
+        if not forward(media) and np.max(np.abs(inside.medium.g)) > MOST_TRUNCATED:
+            return f"abs(g) of object {obj.name} is above {MOST_TRUNCATED} in a scene where a medium varies"
     return ""
 
 
-def inside_cells_of(media: WalkMedia, edge: float = EDGE) -> list[InsideCells]:
-    """The cells of all objects, `edge` mean free paths wide."""
+def inside_cells_of(media: WalkMedia) -> list[InsideCells]:
+    """The cells of all objects."""
     results = []
     for k, kind in enumerate(media.instance_table.kind):
-        sigma_t = media.mm_per_unit * np.atleast_1d(media.specs[kind].medium.sigma_t)
-        box, h = _edges(media, k, edge)
-        depth = np.inf if media.varies else DEPTH / float(np.min(sigma_t))
+        box, h = _edges(media, k)
+        depth = np.inf if media.varies else DEPTH / float(np.min(_extinction(media, kind)))
         area = float(
             np.mean(np.array(_entries(media, k, [mi.Float(v.astype(np.float32)) for v in lattice(2**10)]).weight))
         )
@@ -192,12 +193,23 @@ def inside_cells_of(media: WalkMedia, edge: float = EDGE) -> list[InsideCells]:
     return results
 
 
-def _edges(media: WalkMedia, k: int, edge: float) -> tuple[tuple[np.ndarray, np.ndarray], float]:
+def _edges(media: WalkMedia, k: int) -> tuple[tuple[np.ndarray, np.ndarray], float]:
     """The box of object k, and the edge of its cells, scene units."""
     kind = media.instance_table.kind[k]
     low, high = ends_of(corners(media.objects[kind].scene.bbox(), _to_world(media, k)[None]))
-    sigma_t = media.mm_per_unit * float(np.mean(media.specs[kind].medium.sigma_t))
-    return (low[0], high[0]), grid_edge((low[0], high[0]), edge / sigma_t)
+    edge = FORWARD_EDGE if forward(media) else EDGE
+    return (low[0], high[0]), grid_edge((low[0], high[0]), edge / float(np.mean(_extinction(media, kind))))
+
+
+def _extinction(media: WalkMedia, kind: int) -> np.ndarray:
+    """Of the light that is precomputed, by channel, 1/(scene unit)."""
+    medium = media.specs[kind].medium
+    return media.mm_per_unit * (split_extinction(medium) if forward(media) else np.atleast_1d(medium.sigma_t))
+
+
+def forward(media: WalkMedia) -> bool:
+    """Whether rays of light go on through forward events: some medium is uneven in direction, none in space."""
+    return not (media.varies or media.carried) and any(np.any(spec.medium.g) for spec in media.specs)
 
 
 def _to_world(media: WalkMedia, k: int) -> np.ndarray:
@@ -224,8 +236,11 @@ class _Ray:
     o: mi.Point3f
     d: mi.Vector3f
     off: mi.Vector3f  # from o to where the ray is clear of the surface
-    flux: mi.Spectrum  # where it entered, times reflectances since
-    T: mi.Spectrum  # transmittance since it entered
+    flux: mi.Spectrum  # where it entered, times reflectances since, and albedo and 1 - q of forward events
+    T: mi.Spectrum  # transmittance since it entered; 1 where flights are drawn
+    entered: mi.Float  # flux at the entry, of the brightest channel
+    channel: mi.UInt32  # by which flights are drawn
+    density: mi.Spectrum  # of the flights so far by each channel, over the mean
     alive: mi.Bool
     rng: mi.PCG32
 
@@ -239,8 +254,9 @@ class _Rays:
         k: number of the object.
         grid: its cells.
         D: ∫ L_0 x_j dx dw over the inside of each cell by channel, x about its centre in units of h.
-        octants: of each octant of directions w to the light ∫ L_0 dx dw by channel, 0, ∫ L_0 w dx dw of all channels,
-            0; None where directions do not count.
+        w: by channel ∫ L_0 w dw dx, w the direction to the light, and likewise w_x², w_y², w_x w_y, w_x w_z, w_y w_z;
+            None where directions do not count.
+        forward: whether rays go on through forward events.
     """
 
     scene: mi.Scene
@@ -248,7 +264,8 @@ class _Rays:
     k: mi.Int32
     grid: InsideCells
     D: mi.Float
-    octants: mi.Float | None
+    w: mi.Float | None
+    forward: bool
 
     def enter(self, number: int, rays: int, seed: int) -> _Ray:
         """Rays of emitters at points of the surface, refracted into the object.
@@ -284,7 +301,11 @@ class _Rays:
         flux = dr.select(enters, light * value * (cosine * bend * at.weight / opaque(rays)), 0)
         enters &= dr.max(flux) > 0
         T = dr.full(mi.Spectrum, 1, rays)
-        return _Ray(mi.Point3f(at.p), d, media.clear(self.k, si.n, d), mi.Spectrum(flux), T, mi.Bool(enters), rng)
+        channel = dr.minimum(mi.UInt32(rng.next_float32() * len(T)), len(T) - 1)
+        return _Ray(
+            mi.Point3f(at.p), d, media.clear(self.k, si.n, d), mi.Spectrum(flux), T, dr.max(flux), channel,
+            mi.Spectrum(T), mi.Bool(enters), rng,
+        )  # fmt: skip
 
     def _incident(self, si: mi.SurfaceInteraction3f, u: mi.Point2f, rng: mi.PCG32) -> tuple[mi.Vector3f, mi.Spectrum]:
         """A direction w to an emitter, and the light from there over its density.
@@ -320,7 +341,7 @@ class _Rays:
 
     def segment(self, ray: _Ray) -> _Ray:
         """Light along a ray as far as the surface, and its reflection there."""
-        media, d, rng = self.media, ray.d, ray.rng
+        media, d = self.media, ray.d
         si = media.instance_scene.intersect(
             media.scene, mi.Ray3f(ray.o + ray.off, d), mi.RayFlags.All, active=ray.alive
         )
@@ -329,6 +350,13 @@ class _Rays:
 
         # ---- light along it
         self._add(ray, far, alive)
+        if self.forward:
+            return self._fly(ray, si, far, alive)
+        return self._reflect(ray, si, alive, ray.T * self._transmittance(ray, far))
+
+    def _reflect(self, ray: _Ray, si: mi.SurfaceInteraction3f, alive: mi.Bool, T: mi.Spectrum) -> _Ray:
+        """Reflection at the surface, where the ray arrives with the transmittance T."""
+        media, d, rng = self.media, ray.d, ray.rng
 
         # ---- reflection: flux F, with roulette; behind an object that overlaps the ray goes on, and behind its own
         # boundary if rounding has put it outside
@@ -337,13 +365,42 @@ class _Rays:
         own = met & (dr.dot(si.n, d) > 0)
         bs, value = sample_bsdf(media.boundary(self.k), si, rng, _only(mi.BSDFFlags.Reflection))
         new, _ = sided(si, bs.wo)
-        T = ray.T * self._transmittance(ray, far)
-        left = dr.max(ray.flux * value * T) / dr.maximum(dr.max(ray.flux), 1e-30)
+        left = dr.max(ray.flux * value * T) / dr.maximum(ray.entered, 1e-30)
         survive = dr.minimum(left / ROULETTE, 1)
         reflected = (dr.dot(si.n, new) < 0) & (rng.next_float32() < survive)
         d = mi.Vector3f(dr.select(own, new, d))
         flux = dr.select(own, ray.flux * value / dr.maximum(survive, 1e-20), ray.flux)
-        return _Ray(mi.Point3f(si.p), d, media.clear(self.k, si.n, d), flux, T, alive & (~own | reflected), rng)
+        return replace(
+            ray, o=mi.Point3f(si.p), d=d, off=media.clear(self.k, si.n, d), flux=flux, T=T,
+            alive=alive & (~own | reflected),
+        )  # fmt: skip
+
+    def _fly(self, ray: _Ray, si: mi.SurfaceInteraction3f, far: mi.Float, alive: mi.Bool) -> _Ray:
+        """A flight to a forward event, or to the surface and its reflection there."""
+        media, rng = self.media, ray.rng
+
+        # ---- flux T / p at the surface, flux sigma_s T / p at an event, p the mean over channels
+        m = media.coefficients(self.k, ray.o)
+        t = free_path(m, ray.channel, rng.next_float32())
+        flight = fly(m, ray.flux, ray.density, ray.channel, t, far)
+        ray = replace(ray, flux=flight.weight, density=flight.density)
+        at_surface = self._reflect(ray, si, alive & ~flight.scatters, ray.T)
+
+        # ---- a turn by the phase function, of which 1 - q is forward
+        u = mi.Point2f(rng.next_float32(), rng.next_float32())
+        d, flux, density = turn(m, ray.flux, ray.density, ray.channel, ray.d, u, media.same_g)
+        flux *= kept_forward(dr.dot(ray.d, d), m.g)
+
+        # ---- roulette
+        survive = dr.minimum(dr.max(flux) / dr.maximum(ray.entered * ROULETTE, 1e-30), 1)
+        alive = alive & flight.scatters & (rng.next_float32() < survive)
+        at_event = replace(
+            ray, o=mi.Point3f(ray.o + ray.d * t), d=d, off=media.behind(self.k, d),
+            flux=flux / dr.maximum(survive, 1e-20), density=density, alive=alive,
+        )  # fmt: skip
+        a, b = vars(at_event), vars(at_surface)
+        state = {key: dr.select(flight.scatters, a[key], b[key]) for key in a if key != "rng"}
+        return _Ray(**state, rng=rng)
 
     def _add(self, ray: _Ray, far: mi.Float, active: mi.Bool) -> None:
         """Add light to the cells at ALONG points of a segment, drawn by mean_c sigma_c T_c / (1 - T_c(far))."""
@@ -352,7 +409,8 @@ class _Rays:
         low, scale = mi.Point3f(*(opaque(v) for v in grid.low)), opaque(1 / grid.h)
         counts = mi.Vector3i(*(dr.opaque(mi.Int32, int(v)) for v in grid.counts))
         ends = 1 - dr.exp(-sigma_t * far)
-        octant = sum(dr.select(ray.d[a] < 0, mi.Int32(1 << a), 0) for a in range(3))
+        a, b, c_ = -ray.d
+        angles = mi.Vector4f(a, b, c_, a * a), mi.Vector4f(b * b, a * b, a * c_, b * c_)
         u_0, first = ray.rng.next_float32(), mi.UInt32(ray.rng.next_float32() * n)
 
         def add(j: mi.UInt32, rng: mi.PCG32) -> tuple[mi.UInt32, mi.PCG32]:
@@ -371,14 +429,12 @@ class _Rays:
             slot = dr.gather(mi.Int32, grid.slot, (cell.z * counts.y + cell.y) * counts.x + cell.x, held)
             held &= slot >= 0
 
-            # ---- light x_j by channel, and by octant
+            # ---- light x_j by channel, and light by directions
             for c in range(n):
-                dr.scatter_add(self.D, mi.Vector4f(1, y.x, y.y, y.z) * light[c], mi.UInt32(slot * n + c), held)
-            if self.octants is not None:
-                index, v = mi.UInt32(slot * OCTANTS + octant) * 2, ray.d * -dr.sum(light)
-                by_channel = mi.Vector4f(*(light[c] if c < n else mi.Float(0) for c in range(4)))
-                dr.scatter_add(self.octants, by_channel, index, held)
-                dr.scatter_add(self.octants, mi.Vector4f(v.x, v.y, v.z, 0), index + 1, held)
+                index = mi.UInt32(slot * n + c)
+                dr.scatter_add(self.D, mi.Vector4f(1, y.x, y.y, y.z) * light[c], index, held)
+                for i, part in enumerate(angles if self.w is not None else ()):
+                    dr.scatter_add(self.w, part * light[c], index * 2 + i, held)
             return j + 1, rng
 
         dr.while_loop((mi.UInt32(0), mi.PCG32(ray.rng)), lambda j, rng: j < ALONG, add, label="points of a ray")
@@ -398,13 +454,13 @@ def _only(flags: int) -> mi.BSDFContext:
 def _moments(
     scene: mi.Scene, media: WalkMedia, k: int, grid: InsideCells, seed: int, rays: int, directional: bool
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """D of the cells of object k, shape (slots, channels, 4), and its octants, (slots, octants, 8) if `directional`."""
+    """D of the cells of object k, shape (slots, channels, 4), and their `w`, (slots, channels, 8) if `directional`."""
     n = len(mi.Spectrum(0))
     D = dr.zeros(mi.Float, grid.slots * n * 4)
-    octants = dr.zeros(mi.Float, grid.slots * OCTANTS * 8) if directional else None
-    traced = _Rays(scene, media, dr.full(mi.Int32, k, rays), grid, D, octants)
+    w = dr.zeros(mi.Float, grid.slots * n * 8) if directional else None
+    traced = _Rays(scene, media, dr.full(mi.Int32, k, rays), grid, D, w, forward(media))
     start = traced.enter(k, rays, seed)
     dr.while_loop((start,), lambda ray: ray.alive, lambda ray: (traced.segment(ray),), label="rays of light")
-    dr.eval(D, octants)
+    dr.eval(D, w)
     D = np.array(D).reshape(grid.slots, n, 4)
-    return D, np.array(octants).reshape(grid.slots, OCTANTS, 8) if directional else None
+    return D, np.array(w).reshape(grid.slots, n, 8) if directional else None
