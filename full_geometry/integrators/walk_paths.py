@@ -504,9 +504,7 @@ class PathTracer:
             again &= k == light.departure.object
         light = replace(light, L=L, previous=dr.select(again, light.previous, si.p), sighted=again,
                         pdf=dr.select(again, light.pdf, bs.pdf), delta=delta & ~again, scattered=scattered,
-                        precomputed=mirrors & ~enters)  # fmt: skip
-        if self.visitor.forward:
-            light = replace(light, run=replace(light.run, share=dr.select(mirrors & ~enters, 0, light.run.share)))
+                        precomputed=mirrors & ~enters, run=light.run and light.run.ended())  # fmt: skip
         if media.inner is not None:
             delta = ~again & (delta | enters | encloses)
             L = L + self.visitor.spread_inner_lights(walk, scattered & enters)

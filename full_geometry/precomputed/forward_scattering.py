@@ -20,7 +20,7 @@ unlike similarity relations, of which it has the lengths.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -100,3 +100,7 @@ class ForwardRun:
         kept = kept_forward(dr.dot(self.along, along), self.g)
         share = dr.select(self.turned, self.share * kept, self.share)
         return ForwardRun(share, self.along, self.g, dr.full(mi.Bool, False, dr.width(self.turned)))
+
+    def ended(self) -> ForwardRun:
+        """Outside: nothing is left of what a mirror shows; the first event in an object begins anew."""
+        return replace(self, share=dr.zeros(mi.Spectrum, dr.width(self.share)))
