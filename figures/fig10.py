@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from figures.computing.learnt import accepting, weight_files
-from figures.parts.part import Part, Result, Task
+from figures.parts.part import Part, Result, Task, unmodelled
 from halfspace_sss.comparison.curve_set import Curve, CurveSet
 from halfspace_sss.comparison.reflectance_curves import FIG10_THETA_I, curves
 from halfspace_sss.materials import load
@@ -34,6 +34,7 @@ def parts(quality: str) -> list[Part]:
     ]
 
 
+@unmodelled
 def traced_curves(task: Task) -> dict[str, Any]:
     """The path-traced curve of one angle."""
     p = task.params

@@ -165,5 +165,5 @@ def _announce(plans: Sequence[Plan]) -> None:
     if sum(bool(p.missing) for p in plans) > 1:
         unknown = sum(len(p.unmeasured) for p in plans)
         more = f" and {unknown} parts not measured yet" if unknown else ""
-        each = {p.keys[name]: s.seconds or 0.0 for p in plans for name, s in p.seconds.items()}  # shared ones once
+        each = {p.keys[name]: seconds or 0.0 for p in plans for name, seconds in p.seconds.items()}  # shared ones once
         say(f"together about {duration(sum(each.values()))}{more}")

@@ -6,13 +6,12 @@ import functools
 import importlib
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 from types import ModuleType
-from typing import NamedTuple
 
 import figures
 from figures.parts.part import QUALITIES, Part, Result, Task, check_quality, keys_of
@@ -23,37 +22,15 @@ from halfspace_sss.progress import Progress, ProgressText
 from halfspace_sss.provenance import check_folder, provenance, write_together
 
 
-class Projected(NamedTuple):
-    """Seconds that a part will take and where that is known from; None and "" if nothing like it was measured."""
+def projected(parts: Sequence[Part], stores: Iterable[PartStore]) -> dict[str, float | None]:
+    """Seconds that parts will take, by name: their work, at the median rate of parts of their kind in the stores.
 
-    seconds: float | None
-    source: str
-
-
-def projected(parts: Sequence[Part], stores: Sequence[tuple[str, PartStore]]) -> dict[str, Projected]:
-    """Seconds of each part, scaled by its work, by name.
-
-    Args:
-        parts: whose time is asked for.
-        stores: (what it is called, where parts were measured), the most telling one first. A part of the same name is
-            taken before others of the same function, of which the median counts.
+    None where no part of the kind was computed.
     """
-    same: dict[tuple[str, str], tuple[float, str]] = {}
-    kinds: dict[str, list[float]] = {}
-    for label, store in stores:
-        for slug, kind, work, seconds in store.seconds():
-            same.setdefault((slug, kind), (seconds / work, f"the same part in {label}"))
-            kinds.setdefault(kind, []).append(seconds / work)
-    results = {}
-    for part in parts:
-        if (part.slug, part.kind) in same:
-            rate, source = same[part.slug, part.kind]
-            results[part.name] = Projected(rate * part.work, source)
-        elif part.kind in kinds:
-            results[part.name] = Projected(median(kinds[part.kind]) * part.work, "like parts")
-        else:
-            results[part.name] = Projected(None, "")
-    return results
+    rates: dict[str, list[float]] = {}
+    for kind, work, seconds in (record for store in stores for record in store.seconds()):
+        rates.setdefault(kind, []).append(seconds / work)
+    return {part.name: median(rates[part.kind]) * part.work if part.kind in rates else None for part in parts}
 
 
 def duration(seconds: float) -> str:
@@ -88,7 +65,7 @@ class Plan:
     keys: Mapping[str, str]
     damaged: Mapping[str, str]
     missing: tuple[str, ...]
-    seconds: Mapping[str, Projected]
+    seconds: Mapping[str, float | None]
 
     @property
     def store(self) -> PartStore:
@@ -98,12 +75,12 @@ class Plan:
     @property
     def projected_seconds(self) -> float:
         """Of the missing parts whose time can be told."""
-        return sum(p.seconds for p in self.seconds.values() if p.seconds is not None)
+        return sum(seconds or 0.0 for seconds in self.seconds.values())
 
     @property
     def unmeasured(self) -> tuple[str, ...]:
         """Missing parts like which nothing was measured."""
-        return tuple(name for name, p in self.seconds.items() if p.seconds is None)
+        return tuple(name for name, seconds in self.seconds.items() if seconds is None)
 
 
 def figure(name: str) -> ModuleType:
@@ -114,12 +91,7 @@ def figure(name: str) -> ModuleType:
 
 
 def plan(name: str, quality: str, out: str | Path) -> Plan:
-    """What is to be done for a figure; reads every finished part, computes nothing.
-
-    Args:
-        name: of the figure.
-        quality: "draft" or "paper".
-        out: folder of all figures; this one lies in OUT/NAME/QUALITY.
+    """What is to be done for a figure, which lies in OUT/NAME/QUALITY; reads every finished part, computes nothing.
 
     Raises:
         ValueError: no such figure or quality, out is a file, or a part is not well formed.
@@ -138,9 +110,8 @@ def plan(name: str, quality: str, out: str | Path) -> Plan:
             sound, damaged[part.name] = False, str(error)
         if not sound:
             missing.append(part.name)
-    measured = [(q, PartStore(folder / q / "parts")) for q in sorted(QUALITIES, key=lambda q: q != quality)]
     ahead = [part for part in parts if part.name in missing and not _elsewhere(folder / quality, part, keys[part.name])]
-    seconds = projected(ahead, measured)
+    seconds = projected(ahead, (PartStore(folder / each / "parts") for each in QUALITIES))
     return Plan(name, quality, folder / quality, parts, keys, damaged, tuple(missing), seconds)
 
 
@@ -261,7 +232,7 @@ def _weight(todo: Plan, part: Part, measured: bool) -> float:
     if not measured:
         missing = [each for each in todo.parts if each.name in todo.missing]
         return len(missing) * part.work / sum(each.work for each in missing)
-    return max(todo.seconds[part.name].seconds if part.name in todo.seconds else 0, LEAST)
+    return max(todo.seconds.get(part.name) or 0.0, LEAST)
 
 
 def _elsewhere(folder: Path, part: Part, key: str) -> PartStore | None:

@@ -7,7 +7,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -166,16 +166,14 @@ class PartStore:
         """Folder in which a part keeps what it has done so far; another key has another one."""
         return self._part_folder(part) / f"unfinished-{key[:16]}"
 
-    def seconds(self) -> list[tuple[str, str, float, float]]:
-        """(folder name, kind, work, seconds) of every part that has a sound record."""
-        results = []
+    def seconds(self) -> Iterator[tuple[str, float, float]]:
+        """Kind, work and seconds of every part that has a sound record."""
         for path in sorted(self.folder.glob("*/record.json")):
             try:
                 record = json.loads(path.read_text(encoding="utf-8"))
-                results.append((path.parent.name, record["kind"], float(record["work"]), float(record["seconds"])))
+                yield record["kind"], float(record["work"]), float(record["seconds"])
             except (ValueError, KeyError, TypeError, OSError):
                 continue  # what a damaged record says of time is not worth an error
-        return results
 
     def _part_folder(self, part: Part) -> Path:
         return self.folder / part.slug
