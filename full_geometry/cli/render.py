@@ -132,7 +132,24 @@ def render(
             files = _publish(picture, file, drawers)
             shared.say(f"{result.spp} samples a pixel in {result.seconds:.1f} s; {error}")
             shared.say_files(files)
+            if is_bssrdf(loaded.integrator()):
+                shared.say(*_off(loaded, result.mean, k, transport.model))
     shared.say(*(loaded.integrator().gathered if is_bssrdf(loaded.integrator()) else ()))
+
+
+def _off(scene: Any, image: np.ndarray, sensor: int, model: str | None) -> list[str]:
+    """How far off models are on each object of an image, where walks can tell."""
+    import mitsuba as mi
+
+    from full_geometry.scenes.against_walks import mean_ratios, told
+    from full_geometry.scenes.scene_files import first_cause
+
+    if mi.is_spectral or scene.integrator().settings.orders:
+        return []
+    try:
+        return told(mean_ratios(scene, image, sensor), model or "the model of the scene")
+    except (ValueError, RuntimeError) as error:
+        return [f"how far models are off is not known, as random walks refuse the scene: {first_cause(error)}"]
 
 
 def _sensors(text: str, scene: Any) -> list[int]:

@@ -113,7 +113,8 @@ def load_scene(
 
     Where model or orders are asked for and the integrator of the scene shows no light from inside, ours takes its
     place, with its mm_per_unit, max_depth, rr_depth and hide_emitters; a warning says so. A scene without integrator
-    gets ours.
+    gets `bssrdf` where it or the caller names a model or gathered light, else `translucent_walk`, which is right for
+    every object.
 
     Args:
         scene: a dict as for `mitsuba.load_dict`, or the path of an XML file.
@@ -164,7 +165,8 @@ def open_scene(
             props["model"] = model
         if orders:
             props["orders"] = orders
-    _choose_integrator(state, walks, (bool(model), bool(model or orders)), settings or {})
+    named = model not in (None, PATH_TRACED) or any(names) or (light is not None and light not in WALK_LIGHTS)
+    _choose_integrator(state, walks, not named, (bool(model), bool(model or orders)), settings or {})
     for plugin, given in zip(_INTEGRATORS.values(), _settings(settings or {})):
         _set_parameters(state, plugin, given)
     _set_parameters(state, "bitmap", {"format": "variant"} if floats else {})
@@ -261,8 +263,13 @@ def _unreadable(scene: dict | str | Path, error: RuntimeError) -> ValueError:
     return ValueError(f"{name} cannot be read: {first_cause(error)}")
 
 
-def _choose_integrator(state: Any, walks: bool, asked: tuple[bool, bool], settings: Mapping[str, float]) -> None:
-    """Make the integrator fit: whether a model, or anything, is asked for; one that is made gets the settings."""
+def _choose_integrator(
+    state: Any, walks: bool, unnamed: bool, asked: tuple[bool, bool], settings: Mapping[str, float]
+) -> None:
+    """Make the integrator fit: whether a model, or anything, is asked for; one that is made gets the settings.
+
+    Where there is none, and no model is named either (`unnamed`), it is `translucent_walk`.
+    """
     wanted, (model, anything) = _INTEGRATORS[walks], asked
     ours = [node.props for node in state.nodes if node.props.plugin_name() in _INTEGRATORS.values()]
     for props in ours if model else ():
@@ -271,7 +278,9 @@ def _choose_integrator(state: Any, walks: bool, asked: tuple[bool, bool], settin
         return
     others = [node.props for node in state.nodes if node.type == mi.ObjectType.Integrator]
     if not others:
-        state.nodes[0].props["integrator"] = mi.load_dict({"type": wanted, **_settings(settings)[walks]})
+        by_walks = walks or unnamed
+        plugin = {"type": _INTEGRATORS[by_walks], **_settings(settings)[by_walks]}
+        state.nodes[0].props["integrator"] = mi.load_dict(plugin)
     elif anything:
         name = others[0].plugin_name()
         warnings.warn(f"the integrator {name!r} of the scene is replaced by {wanted!r}", stacklevel=3)
