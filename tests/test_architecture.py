@@ -201,6 +201,21 @@ def test_function_bodies_have_at_most_60_lines() -> None:
     assert not long
 
 
+def test_the_ways_through_the_house_are_short_and_name_functions_that_are_there() -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    house = text[text.index("## The house") : text.index("## To add")]
+    assert len(house.splitlines()) <= 60
+    for way in ("### The way of a ray", "### The way of a medium"):
+        rows = [line.split("|")[1:3] for line in house.partition(way)[2].partition("###")[0].splitlines()[4:]]
+        steps, file = [], ""
+        for names, place in (row for row in rows if row):
+            file = (re.findall(r"`([\w/]+\.py)`", place) or [file])[0]
+            code = (ROOT / "full_geometry" / file).read_text(encoding="utf-8")
+            steps += (found := re.findall(r"`(\w+)`", names))
+            assert found and all(f"def {name}(" in code for name in found), (names, file)
+        assert 5 <= len(steps) <= 9
+
+
 def test_no_file_is_named_utils() -> None:
     assert not [path for path in SOURCES if path.stem in ("utils", "util", "helpers", "misc", "common")]
 
