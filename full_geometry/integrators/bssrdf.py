@@ -95,7 +95,7 @@ def _class(variant: str) -> type:
             return self.gathering.of(scene, objects, self.settings)
 
         def take_over(self, other: mi.Integrator) -> None:
-            """The objects of another integrator of this class that differs in light alone."""
+            """Take the objects of another integrator of this class that differs in light alone."""
             self._objects.take_over(other._objects)
 
         def check(self, scene: mi.Scene, without: Collection[str] = ()) -> None:
@@ -169,8 +169,8 @@ def _class(variant: str) -> type:
             with undisturbed(), dr.suspend_grad():
                 objects = self._prepared(scene) if self._lit is None else self._lit
                 ray = shown(scene, objects, self.settings, ray)
-                parts, hit, chance = trace_paths(scene, objects, self.settings, sampler, ray, active)
-                squares = dr.select(hit & active, mi.Float64(dr.squared_norm(chance)), 0)
+                parts, hit, unconnected = trace_paths(scene, objects, self.settings, sampler, ray, active)
+                squares = dr.select(hit & active, mi.Float64(dr.squared_norm(unconnected)), 0)
                 dr.scatter_add(self._unconnected, squares, mi.UInt32(0))
             return parts[0] + parts[1], hit | mi.Bool(shows_sky(scene, self.settings.hide_emitters)), []
 
@@ -181,7 +181,7 @@ def _class(variant: str) -> type:
 
         @property
         def unconnected(self) -> float:
-            """Of light that orders below two met by chance, squares summed over channels and samples of an image."""
+            """Squares of light of orders 0 and 1 that phase sampling alone hits, summed over the samples."""
             return float(self._unconnected[0])
 
         @property
@@ -331,7 +331,7 @@ def replayer(objects: list[TranslucentObject], settings: Settings) -> mi.Integra
                 parts, hit, _ = trace_paths(scene, objects, settings, sampler, ray, given["active"])
                 return parts[0] + parts[1], hit | mi.Bool(shows_sky(scene, settings.hide_emitters)), [], parts
             parts, backward = given["state_in"], mode == dr.ADMode.Backward
-            d = replay_paths(scene, objects, settings, sampler, ray, parts, given["δL"], backward)
+            d = replay_paths(scene, objects, settings, sampler, ray, parts, d=given["δL"], backward=backward)
             return d, mi.Bool(True), [], parts
 
     return Replayer(mi.Properties())

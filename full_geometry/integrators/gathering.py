@@ -2,7 +2,8 @@
 
 At each point the mean of the incident radiance, weighted by a(mu) mu, is estimated per channel by emitter sampling and
 by directions of the cosine (balance heuristic); what other surfaces send is traced along the latter, by the path loop.
-B = T L follows, see `precomputed.transfer`, and at an exit L_o(x_o, w_o) = a(w_o) B(x_o), blended between points.
+B = T L follows, T the transport matrix (`precomputed.transport_matrix`), and at an exit L_o(x_o, w_o) = a(w_o) B(x_o),
+blended between points.
 Jensen and Buhler (2002) take two passes so with a dipole; here the second is a sparse matrix that outlives the light.
 
 What is not known: a dependence of the model on the azimuth between light and view; how light varies over directions,
@@ -28,15 +29,15 @@ from full_geometry.integrators.lighting import EnvironmentMean, Lights
 from full_geometry.integrators.surface_paths import trace_paths
 from full_geometry.precomputed.inner import Events, InnerLight, has_inner_light
 from full_geometry.precomputed.point_pairs import Rays
-from full_geometry.precomputed.transfer import (
+from full_geometry.precomputed.transport_matrix import (
     SEED,
     Albedo,
     Hemispheres,
     Incident,
-    Transfer,
+    TransportMatrix,
     bent,
     cosine,
-    transfer,
+    transport_matrix,
 )
 from full_geometry.sampling.light_points import GOLDEN, SurfacePoints
 from full_geometry.walk.emission import emitter_pdf, mis_weight, sample_emitter
@@ -50,7 +51,7 @@ if TYPE_CHECKING:
 
 DIRECTIONS = 2**18  # of all points of an object, by emitters, and as many by the cosine
 FEWEST, MOST = 24, 1024  # of a point
-PART = 1 / 8  # of the samples of a transfer
+PART = 1 / 8  # of the samples of a transport matrix
 SPREADINGS = 4  # of what other surfaces send,
 BRIGHTEST = 1 / 128  # of the points, which share it no matter how bright
 TRACED = 8  # one of so many directions by the cosine is traced further, where it meets a surface
@@ -61,15 +62,15 @@ class Gathered:
     """Radiance of orders from two on that leaves an object in the light of a scene.
 
     Args:
-        object: of it.
+        object: that the light leaves.
         points: where B is known.
         albedo: a(mu).
         values: B of all points, for each channel the constant and the slope over w_o bent by the boundary.
         inner: at events of order 1 inside; None where that order is traced.
-        transfer: of the model.
+        matrix: transport matrix of the model.
         light: that arrives, less c.
         parts: independent estimates of it.
-        c: mean radiance of the sky in the channels where alpha is known, else 0, see `lighting.EnvironmentMean`.
+        c: mean radiance of the environment where alpha is known, else 0, see `lighting.EnvironmentMean`.
     """
 
     object: TranslucentObject
@@ -77,22 +78,25 @@ class Gathered:
     albedo: Albedo
     values: mi.Float
     inner: InnerLight | None
-    transfer: Transfer
+    matrix: TransportMatrix
     light: Incident
     parts: tuple[Incident, ...] = ()
     c: np.ndarray | float = 0.0
 
     def radiance(self, out: SurfacePoint, active: mi.Bool) -> mi.Spectrum:
         """L_o of an exit; 0 below the horizon."""
+        # B_0 + B_1.w_o at the exit, blended between points, w_o bent by the boundary
         size = dr.size_v(mi.Spectrum)
         B = self.points.blend(self.values, 4 * size, out.p, out.n, active)
         rows, w = [B[4 * c : 4 * c + 4] for c in range(size)], bent(out.w, out.n_out, self.albedo.eta)
         B = mi.Spectrum([b + x * w.x + y * w.y + z * w.z for b, x, y, z in rows])
+
+        # a(w_o) R^e, or alpha where the model knows its directional albedo
         mu = dr.dot(out.w, out.n_out)
         paint = None if self.object.textured is None else self.object.transport.paint(out)
         a = self.albedo(dr.maximum(mu, 0), paint)
         if paint is not None:
-            a *= paint ** mi.Spectrum([opaque(v) for v in self.transfer.e])
+            a *= paint ** mi.Spectrum([opaque(v) for v in self.matrix.e])
         alpha = self.object.transport.alpha
         if alpha is not None:
             known = alpha.known[1]
@@ -102,7 +106,7 @@ class Gathered:
     @cached_property
     def error(self) -> float:
         """Standard error of B by the gathering of light, over its mean; NaN where that is not in parts."""
-        found = np.stack([self.transfer.mean(part) + self.c for part in self.parts])
+        found = np.stack([self.matrix.mean(part) + self.c for part in self.parts])
         spread = found.var(axis=0, ddof=1).mean() if len(found) > 1 else np.nan
         return float(np.sqrt(spread / len(found)) / max(float(found.mean()), 1e-30))
 
@@ -110,35 +114,36 @@ class Gathered:
     def told(self) -> str:
         """How many points, and the noise of B."""
         return (
-            f"gathered at {len(self.points)} points, {1e-6 * self.transfer.nbytes:.0f} MB: noise of the transfer "
-            f"{self.transfer.error:.1%} a point, of the light {self.error:.1%}"
+            f"gathered at {len(self.points)} points, {1e-6 * self.matrix.nbytes:.0f} MB: noise of the transport matrix "
+            f"{self.matrix.error:.1%} a point, of the light {self.error:.1%}"
         )
 
     def kept(self, other: Gathered) -> float:
         """Of the variance of two parts the share that all samples have."""
-        B = self.transfer @ self.light
-        by_light = ((B - self.transfer @ other.light) ** 2).mean()
-        by_transfer = ((B - other.transfer @ self.light) ** 2).mean()
-        whole = by_light + by_transfer
-        return float((0.5 * by_light + PART * by_transfer) / whole) if whole > 0 else 1.0
+        # Var = Var_light + Var_matrix, by one of both exchanged at a time
+        B = self.matrix @ self.light
+        by_light = ((B - self.matrix @ other.light) ** 2).mean()
+        by_matrix = ((B - other.matrix @ self.light) ** 2).mean()
+        whole = by_light + by_matrix
+        return float((0.5 * by_light + PART * by_matrix) / whole) if whole > 0 else 1.0
 
 
 class Gathering:
     """Gathered light of the objects of a scene, kept until something in the scene changes.
 
     Args:
-        part: 0 for all samples; others are independent of each other, with a share `PART` of the samples of a transfer
-            and half the light.
+        part: 0 for all samples; others are independent of each other, with a share `PART` of the samples of a
+            transport matrix and half the light.
         seed: of what is drawn.
 
     Attributes:
-        seconds: by `clock`, of the transfers and of the light, as they were last found.
+        seconds: by `clock`, of the transport matrices and of the light, as they were last found.
     """
 
     def __init__(self, part: int = 0, seed: int = 0) -> None:
         self._part, self._seed, self.seconds = part, seed, (0.0, 0.0)
         self._objects: list[TranslucentObject] = []
-        self._transfers: list[Transfer | None] = []
+        self._matrices: list[TransportMatrix | None] = []
         self._events: list[Events | None] = []
         self._light: Snapshot | None = None
         self._found: list[TranslucentObject] = []
@@ -150,6 +155,7 @@ class Gathering:
             ValueError: an object is open or has no known area, or light that arrives is not finite.
         """
         if not same_objects(objects, self._objects):
+            # what outlives the light: transport matrices, and places of events inside
             spread = [spreads(obj) for obj in objects]
             for obj, one in zip(objects, spread):
                 if one:
@@ -157,16 +163,17 @@ class Gathering:
             started = clock()
             share = PART if self._part else 1.0
             seed = SEED + self._part + 10 * self._seed
-            made = [transfer(obj, share, seed) if one else None for obj, one in zip(objects, spread)]
+            made = [transport_matrix(obj, share, seed) if one else None for obj, one in zip(objects, spread)]
             inner = [bool(one and not self._part and has_inner_light(obj)) for obj, one in zip(objects, spread)]
             self._events = [Events.of(obj, COUNT) if one else None for obj, one in zip(objects, inner)]
-            self._transfers, self._objects, self._light = made, objects, None
+            self._matrices, self._objects, self._light = made, objects, None
             self.seconds = (clock() - started, 0.0)
         state = light_state(scene)
         if state != self._light:
+            # the light, in two parts that tell its noise
             started = clock()
             seed, parts = 1000 * self._part + 10_000 * self._seed, 1 if self._part else 2
-            ways = list(zip(self._transfers, self._events))
+            ways = list(zip(self._matrices, self._events))
             self._found = _lit(scene, objects, ways, settings, seed, parts)
             self._light, self.seconds = state, (self.seconds[0], clock() - started)
         return self._found
@@ -209,10 +216,10 @@ def light_state(scene: mi.Scene) -> Snapshot:
 
 
 def _lit(
-    scene: mi.Scene, objects: list[TranslucentObject], ways: list[tuple[Transfer | None, Events | None]],
+    scene: mi.Scene, objects: list[TranslucentObject], ways: list[tuple[TransportMatrix | None, Events | None]],
     settings: Settings, seed: int, parts: int,
 ) -> list[TranslucentObject]:  # fmt: skip
-    """The objects, those with a transfer by what leaves them; what they send each other is sampled by their models."""
+    """The objects, those with a transport matrix by what leaves them; what they send each other is sampled."""
     found = list(objects)
     for k, (obj, (T, events)) in enumerate(zip(objects, ways)):
         if T is not None:
@@ -222,36 +229,53 @@ def _lit(
 
 
 def _leaving(
-    scene: mi.Scene, objects: list[TranslucentObject], k: int, of: tuple[Transfer, Events | None], settings: Settings,
-    seed: int, parts: int,
+    scene: mi.Scene, objects: list[TranslucentObject], k: int, of: tuple[TransportMatrix, Events | None],
+    settings: Settings, seed: int, parts: int,
 ) -> Gathered:  # fmt: skip
     """B of object k, by light in parts whose differences tell the noise, and light inside."""
+    # ---- L at the points, in parts, and the light of emitters by ray
     obj, (T, events) = objects[k], of
     found, rays = _incident(scene, objects, T, obj.geometry.clearance, settings, 2 * k + seed, parts)
     lights, others = zip(*found)
     if not all(np.isfinite(light.mean).all() for light in lights):
         raise ValueError(f"light at object {obj.geometry.name} must be finite, got NaN or infinity")
+
+    # ---- J at events inside, with what other surfaces send to the points
     inner = None
     if events is not None:
         seen = mi.Float(np.mean(others, axis=0).astype(np.float32).ravel())
         inner = inner_light(scene, objects, k, settings, events, (T.points, seen))
-    sky = EnvironmentMean.of(scene, Lights.of(scene), [obj])
-    c = np.zeros(len(T.trusted)) if sky is None else T.trusted * np.ravel(np.array(sky.mean))
+
+    # ---- B = T (L - c) + c, c the mean of the environment where alpha is known
+    mean = EnvironmentMean.of(scene, Lights.of(scene), [obj])
+    c = np.zeros(len(T.trusted)) if mean is None else T.trusted * np.ravel(np.array(mean.mean))
     lights = tuple(replace(light, mean=light.mean - c.astype(np.float32)) for light in lights)
     light = Incident.mean_of(lights)
     B = T @ light
     B[:, :, 0] += c
-    if obj.textured is None:  # averages over the neighbourhood would cross edges of textures
+
+    # ---- what S along directions of light has beyond T; averages over the neighbourhood would cross edges of textures
+    if obj.textured is None:
         direct = np.maximum(rays.light.sum(axis=1) / T.around.whole - c, 0)
         B += T.beyond(direct.astype(np.float32), rays)
     values = mi.Float(B.astype(np.float32).ravel())
-    return Gathered(obj, T.points, T.albedo, values, inner, T, light, lights, c)
+    return Gathered(
+        object=obj,
+        points=T.points,
+        albedo=T.albedo,
+        values=values,
+        inner=inner,
+        matrix=T,
+        light=light,
+        parts=lights,
+        c=c,
+    )
 
 
 def _incident(
     scene: mi.Scene,
     objects: list[TranslucentObject],
-    T: Transfer,
+    T: TransportMatrix,
     e: mi.Float,
     settings: Settings,
     seed: int,
@@ -261,22 +285,27 @@ def _incident(
 
     Parts are independent estimates by as many directions each, of one launch. Rays have the light of emitters alone.
     """
+    # ---- n directions for each point and part; lanes of kernels that serve other numbers of points too
     count, rows = len(T.points), len(T.points) * parts
     n = int(np.clip(DIRECTIONS // (2 * count), FEWEST, MOST)) // TRACED * TRACED
-    # kernels are those of other numbers of points too
     lane, each, few, all_few = dr.arange(mi.UInt32, rows * n), *_numbers(n, n // TRACED, rows * (n // TRACED))
-    # directions that are traced further come first: beside each other, as lanes that wait cost as much
+
+    # ---- direction s of row j: those that are traced further come first, as lanes that wait cost as much
     traced, rest = lane < all_few, lane - all_few
     i = rest % (each - few)
     s = dr.select(traced, lane % few * TRACED, i + i // (TRACED - 1) + 1)
     j = dr.select(traced, lane // few, rest // (each - few))
+
+    # ---- light by emitters and by the cosine, with MIS weights, and what other surfaces send along the latter
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(100 + seed, dr.width(lane))
     point = j % _numbers(count)[0]
     at = GatheringPoint(*(dr.gather(type(v), v, point) for v in (T.points.p, T.points.n, T.points.n_out)), e)
     u, v = (_stratified(sampler, j, s, each) for _ in range(2))
     aimed, w_e = by_emitters(scene, objects[0].instance_scene, T.albedo, at, u)
-    met, more, a, w_c, on = by_cosine(scene, objects, T.albedo, settings, at, v, traced, sampler)
+    met, more, a, w_c, on = by_cosine((scene, objects, settings), T.albedo, at, v, traced, sampler)
+
+    # ---- Σ L and Σ L (bent w - middle) over the directions of each row
     around = T.around
     centre = dr.gather(mi.Vector3f, mi.Vector3f(around.middle.T.astype(np.float32)), point)
     d_e, d_c = (bent(w, at.n_out, T.albedo.eta) - centre for w in (w_e, w_c))
@@ -285,6 +314,8 @@ def _incident(
     values = [mi.Spectrum(v) + dr.zeros(mi.Float, rows * n) for v in values]
     each_light = [mi.Spectrum(v) + dr.zeros(mi.Float, rows * n) for v in (aimed, met)]
     dr.eval(values, each_light, w_e, w_c)
+
+    # ---- lanes in the order of rows and directions again
     j, s = lane // each, lane % each
     order = dr.select(s % TRACED == 0, j * few + s // TRACED, all_few + j * (each - few) + s - s // TRACED - 1)
     sums = [dr.block_sum(dr.gather(mi.Float, v, order), n) for value in values for v in value]
@@ -310,10 +341,13 @@ def _of_part(points: SurfacePoints, around: Hemispheres, found: np.ndarray) -> t
         found: (points, 9, channels), with the weight a(mu) mu: light of emitters, and times directions about their
             middle; what other surfaces send, and times these; 1 where they are.
     """
+    # what few directions bring is averaged over the neighbourhood
     direct, sent, seen = found[:, 0], found[:, 4], found[:, 8]
     steady = _steadied(sent)
     spread = _spread(points, steady * sent)
     first = found[:, 1:4] + _spread(points, steady[:, None] * found[:, 5:8])
+
+    # ∫ a mu L / ∫ a mu, and the first moment likewise
     parts = ((direct + spread) / around.whole, np.moveaxis(first, 1, 2) / around.whole[:, :, None])
     others = spread / np.maximum(_spread(points, seen), 1e-30)
     return Incident(*(part.astype(np.float32) for part in parts)), others
@@ -358,7 +392,7 @@ def _stratified(sampler: mi.Sampler, j: mi.UInt32, s: mi.UInt32, n: mi.UInt32) -
 
 
 def _weight(albedo: Albedo, at: GatheringPoint, w: mi.Vector3f) -> tuple[mi.Spectrum, mi.Float]:
-    """a(mu) mu over the density of the cosine, and that density."""
+    """a(mu) mu over the density mu / pi of the cosine, and that density."""
     mu = cosine(w, at.n, at.n_out)
     return albedo(mu) * dr.pi, mu * dr.inv_pi
 
@@ -371,25 +405,39 @@ def by_emitters(
     u: mi.Point2f,
     c: mi.Spectrum | float = 0.0,
 ) -> tuple[mi.Spectrum, mi.Vector3f]:
-    """Light of sampled emitters less c of the sky, and its direction."""
+    """Light of sampled emitters less c, and its direction: a mu (L - c) V / p_e with its MIS weight."""
+    # w by emitters, and what is between
     here = place(at.p, at.n)
     ds, light = sample_emitter(scene, here, u, mi.Bool(True))
     a, pdf = _weight(albedo, at, ds.d)
     above = (ds.pdf > 0) & (pdf > 0)
     light = dr.select(blocked(scene, instance_scene.ray_to_emitter(here, ds, at.e), above), 0, light)
+
+    # a mu / p_e times L V - c, times p_e / (p_e + p_mu)
     light -= dr.select(ds.emitter.is_environment(), c / dr.maximum(ds.pdf, 1e-30), 0)
     share = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
     return dr.select(above, a * pdf * light * share, 0), ds.d
 
 
 def by_cosine(
-    scene: mi.Scene, objects: list[TranslucentObject], albedo: Albedo, settings: Settings, at: GatheringPoint,
-    u: mi.Point2f, traced: mi.Bool, sampler: mi.Sampler,
+    scenery: tuple[mi.Scene, list[TranslucentObject], Settings], albedo: Albedo, at: GatheringPoint, u: mi.Point2f,
+    traced: mi.Bool, sampler: mi.Sampler,
 ) -> tuple[mi.Spectrum, mi.Spectrum, mi.Spectrum, mi.Vector3f, mi.Bool]:  # fmt: skip
-    """By directions of the cosine: light of emitters that they meet, what other surfaces send along some, a, and w.
+    """Light along directions of the cosine: of emitters that they meet, and of other surfaces along some.
 
-    Last comes along which.
+    Args:
+        scenery: the scene, its objects and settings.
+        albedo: a(mu).
+        at: points.
+        u: uniform numbers of the directions.
+        traced: directions along which what other surfaces send is traced.
+        sampler: of these paths.
+
+    Returns:
+        Light of emitters, of other surfaces, a, the direction w, and where w meets another surface that is traced.
     """
+    # the path loop goes on from the surface, where emission has been counted
+    scene, objects, settings = scenery
     met, a, w, ray, si = met_by_cosine(scene, objects[0].instance_scene, albedo, at, u)
     hidden = replace(settings, hide_emitters=True, light="sampled", max_depth=max(settings.max_depth - 1, -1) or 1)
     on = si.is_valid() & traced
@@ -405,7 +453,8 @@ def met_by_cosine(
     u: mi.Point2f,
     c: mi.Spectrum | float = 0.0,
 ) -> tuple[mi.Spectrum, mi.Spectrum, mi.Vector3f, mi.Ray3f, mi.SurfaceInteraction3f]:
-    """Light of emitters that a direction of the cosine meets, less c of the sky; a, that direction, its ray and hit."""
+    """Light of emitters along a direction of the cosine, less c; a, the direction, its ray, and what that meets."""
+    # w of density p_mu = mu / pi, so that a mu / p_mu = pi a
     w, _ = cosine_above(at.n_out, at.n, u)
     a, pdf = _weight(albedo, at, w)
     here = place(at.p, at.n)
@@ -414,6 +463,8 @@ def met_by_cosine(
     emitter = si.emitter(scene)
     shines = emitter != None  # noqa: E711
     density, _ = emitter_pdf(scene, here, si, shines)
+
+    # pi a (L - c) p_mu / (p_mu + p_e)
     L = emitter.eval(si, shines) - dr.select(emitter.is_environment(), c, 0)
     met = dr.select(shines, mis_weight(pdf, density) * L, 0)
     return a * met, a, w, ray, si

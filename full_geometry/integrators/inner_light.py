@@ -19,7 +19,7 @@ from full_geometry.geometry.rounding import ray_from
 from full_geometry.integrators.ballistic_and_single import light_at_events
 from full_geometry.integrators.lighting import Primal, RenderContext
 from full_geometry.precomputed.inner import Events, InnerLight, bands
-from full_geometry.precomputed.transfer import R_2
+from full_geometry.precomputed.transport_matrix import R_2
 
 if TYPE_CHECKING:
     from full_geometry.objects.objects import TranslucentObject
@@ -45,6 +45,7 @@ def inner_light(
         events: of the object.
         others: points of its surface, and the mean radiance of the other surfaces that each of them sees, by channel.
     """
+    # ---- n directions for each event, one lane each
     context, obj, count = RenderContext.of(scene, objects, settings, Primal()), objects[k], dr.width(events.p)
     sky = scene.environment()
     n = 1 if sky is None or "Constant" in sky.class_name() else UNEVEN
@@ -53,7 +54,8 @@ def inner_light(
     at = tuple(dr.gather(type(v), v, event) for v in (events.p, events.n))
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(SEED + k, n * count)
-    # neighbours take directions, and points of emitters, of one lattice each
+
+    # ---- light at events by connections and along directions; neighbours take both from one lattice each
     steps = [mi.Float(lane * int(2**32 * r)) * 2**-32 for r in R_2]
     u, u_emitter = (mi.Point2f(*(wrapped(x + opaque(t)) for x, t in zip(steps, part))) for part in np.split(turn, 2))
     d, inverse_pdf = _directions(sky, at, float(obj.media[0].eta), u)
@@ -61,7 +63,7 @@ def inner_light(
     met = found.unconnected + found.weight * _beyond(context, obj, found.left, others)
     largest = bands(obj)
 
-    # ---- Σ over ways of Y_lm times light
+    # ---- ∫ Y_lm L dw: Σ over ways of Y_lm(w) times light
     values = [[mi.Spectrum(0)] for _ in range((largest + 1) ** 2)]
     for light, w in [*found.connected, (met, d)]:
         for total, Y in zip(values, dr.sh_eval(w, largest)):
@@ -89,6 +91,7 @@ def _directions(
     """
     if sky is None:
         return mi.warp.square_to_uniform_sphere(u), mi.Float(4 * dr.pi)
+    # ---- w of the environment, bent as the boundary does, or a uniform direction
     e, skyward = opaque(max(eta, 1.0)), u.x < SKYWARD
     least, frame = dr.safe_sqrt(1 - dr.rcp(e * e)), mi.Frame3f(events[1])
     u = mi.Point2f(dr.select(skyward, u.x / SKYWARD, (u.x - SKYWARD) / (1 - SKYWARD)), u.y)
@@ -98,7 +101,7 @@ def _directions(
     inside = dr.select(w.z > 0, dr.safe_sqrt(1 - (1 - w.z * w.z) / (e * e)), least + (1 + least) * w.z)
     d = dr.select(skyward, frame.to_world(_raised(w, inside)), mi.warp.square_to_uniform_sphere(u))
 
-    # ---- density, by the direction that would lead to d
+    # ---- density of both, the former by the direction w that would lead to d
     d_n = mi.Frame3f.cos_theta(frame.to_local(d))
     above = d_n > least
     outside = dr.select(above, dr.safe_sqrt(1 - (1 - d_n * d_n) * e * e), (d_n - least) / (1 + least))
@@ -118,6 +121,7 @@ def _beyond(
     context: RenderContext, obj: TranslucentObject, left: Any, others: tuple[SurfacePoints, mi.Float]
 ) -> mi.Spectrum:
     """Radiance that walks meet outside, but for that of emitters which connections may have found."""
+    # emission, but for what connections find after at most one reflection
     ray = ray_from(place(left.o, left.n), left.d, obj.geometry.clearance)
     si = context.ray_intersect(ray, True, left.left)
     emitter = si.emitter(context.scene, left.left)
@@ -126,6 +130,8 @@ def _beyond(
     if context.small is not None:
         counts &= ~((left.reflections <= 1) & context.sampled_by_nee(emitter, left.d))
     L = dr.select(counts, emitter.eval(si, counts), 0)
+
+    # other surfaces by the mean that points of the object near the exit see of them
     points, values = others
     on = left.left & si.is_valid() & ~shines
     size = dr.size_v(mi.Spectrum)
@@ -134,6 +140,7 @@ def _beyond(
 
 def _steadied(sums: np.ndarray) -> np.ndarray:
     """Sums without the brightest events, whose light goes to those beside them by what they have."""
+    # cut to the size of the next brightest; what a group of neighbours loses goes to it by what it has left
     size = np.abs(sums).max(axis=(1, 2))
     most = np.quantile(size, 1 - BRIGHTEST)
     if not most > 0:

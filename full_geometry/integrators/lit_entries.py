@@ -24,7 +24,7 @@ from full_geometry.geometry.shape import Geometry
 from full_geometry.geometry.snapshot import Snapshot, same_objects
 from full_geometry.integrators.gathering import GatheringPoint, by_emitters, light_state, met_by_cosine, spreads
 from full_geometry.integrators.lighting import Primal, RenderContext
-from full_geometry.precomputed.transfer import Albedo
+from full_geometry.precomputed.transport_matrix import Albedo
 from full_geometry.sampling.light_points import SurfacePoints, uniform_entries
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ class LitEntries:
     def of(
         self, scene: mi.Scene, objects: list[TranslucentObject], settings: Settings, samples: int
     ) -> list[Proposals | None]:
-        """Of each object.
+        """The proposals of each object.
 
         Args:
             scene, objects, settings: what is rendered.
@@ -71,16 +71,21 @@ class LitEntries:
 
 
 def _lit(context: RenderContext, obj: TranslucentObject, count: int) -> Proposals | None:
+    # ---- only where there is something to draw: a closed mesh that spreads light, under light that varies
     geometry = obj.geometry
     faces = geometry.shape.face_count() if geometry.shape.is_mesh() else 1
     if faces == 1 or context.lights.nee_share == 0 or not (spreads(obj) and geometry.closed and geometry.area > 0):
         return obj.proposals
+
+    # ---- e² = mean over the samples of a cell of (a mu L / pdf)²
     cell = _cells(geometry, faces)
     face, square = _brought(context, obj, count)
     k, n = cell[face], cell.max() + 1
     number = np.bincount(k, minlength=n)
     e = np.sqrt(np.bincount(k, square, n) / np.maximum(number, 1))
     e = np.where(number > 0, e, e[k].mean())
+
+    # ---- it pays where E[e²] > `LEAST_GAIN` E[e]²
     mean = e[k].mean()
     if not (np.isfinite(mean) and mean > 0 and (e[k] ** 2).mean() > LEAST_GAIN * mean**2):
         return obj.proposals
@@ -102,10 +107,13 @@ def _brought(context: RenderContext, obj: TranslucentObject, count: int) -> tupl
 
     Half of the mean square over emitter samples and directions by the cosine: a factor of all is of no account.
     """
+    # uniform points of the surface
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(SEED, count)
     entry = uniform_entries(obj.geometry, sampler.next_1d(), sampler.next_2d())
     at = GatheringPoint(entry.p, entry.n, entry.n_out, obj.geometry.clearance)
+
+    # light of a sampled emitter and along a direction of the cosine, by F_t(mu) in place of a(mu)
     albedo = Albedo(np.tile([1.0, 0.0, 0.0], (len(obj.media), 1)), float(obj.media[0].eta))
     c = context.environment_means(obj)[1] if context.uses_environment_mean(obj) else mi.Spectrum(0)
     aimed, _ = by_emitters(context.scene, context.instance_scene, albedo, at, sampler.next_2d(), c)

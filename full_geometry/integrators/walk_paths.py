@@ -51,7 +51,7 @@ from halfspace_sss.tracing.walk import generator, pass_seed
 
 @dataclass
 class LightRecord:
-    """Light of a path so far, and what the MIS weight of the next emission needs to know."""
+    """Light of a path so far, and the last vertex as the MIS weight of the next emission needs it."""
 
     L: mi.Spectrum  # radiance
     previous: mi.Point3f  # vertex that the ray comes from
@@ -112,14 +112,14 @@ class LightVisitor:
     unscattered: UnscatteredLight | None = None
 
     def event(self, walk: Walk, record: LightRecord, event: Event) -> tuple[Walk, LightRecord]:
-        # ---- inner lights
+        # ---- delta lights inside: L += throughput p(cos) E
         record = replace(record, scattered=mi.Bool(True))
         if self.inner_lights is not None:
             at = interaction_of(event.p, walk.medium)
             d, E = self.inner_lights.light(walk.object, at, walk.rng, True, walk.medium)
             record = replace(record, L=record.L + walk.weight * eval_phase(event.m, dr.dot(event.along, d)) * E)
 
-        # ---- emitters whose light arrives unscattered: weight ∫ p(w.w') L_0(x, w') dw'
+        # ---- emitters whose light arrives unscattered: L += throughput ∫ p(w.w') L_0(x, w') dw'
         if self.unscattered is not None:
             counts = self.media.counts(walk.object, walk.order + 1)
             L = walk.weight * self.unscattered.light(self.media, event)
@@ -129,7 +129,7 @@ class LightVisitor:
                 record = replace(record, run=run)
             return walk, replace(record, L=record.L + dr.select(counts, L, 0), precomputed=mi.Bool(True))
 
-        # ---- emitters behind boundaries of index 1
+        # ---- emitters behind boundaries of index 1: L += throughput p L_e T / p_e  p_e / (p_e + p)
         if self.straight_light is not None:
             sees = self.media.straight(walk.object) & self.media.counts(walk.object, walk.order + 1)
             departure = Departure(event.p, event.along, record.departure.ahead, walk.object)
@@ -138,7 +138,7 @@ class LightVisitor:
         if self.connections is None:
             return walk, record
 
-        # ---- connections with light subpaths
+        # ---- connections with light subpaths; where the edge to the last event was straight, they find the rest of it
         smooth = self.media.connects(walk.object)
         edge = record.straight & smooth & (walk.order > 0)  # this event ends one
         connected = record.connected | edge
@@ -146,7 +146,7 @@ class LightVisitor:
         connects = smooth & (walk.order + 2 <= self.media.row("most", walk.object))
         walk, record, _ = dr.if_stmt((walk, record, event), connects, self._connect, _same_state, label="connections")
 
-        # ---- directions to emitters, where no connection finds their light
+        # ---- directions to emitters, where no connection finds their light, with MIS weights against phase sampling
         directed = smooth & ~connected & self.media.counts(walk.object, walk.order + 1)
         record = replace(record, straight=mi.Bool(True), directed=directed)
         walk, record, _ = dr.if_stmt((walk, record, event), directed, self._direct, _same_state, label="directions")
@@ -168,6 +168,7 @@ class LightVisitor:
     ) -> tuple[Walk, LightRecord]:
         if not self.media.any_rough:
             return walk, record
+        # next-event estimation through a rough boundary from inside, of what is not precomputed
         if self.forward:
             record = replace(record, run=record.run.onward(-si.to_world(si.wi)))
         left = self.left(record)
@@ -187,6 +188,7 @@ class LightVisitor:
         self, walk: Walk, record: LightRecord, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32
     ) -> tuple[Walk, LightRecord]:
         """Light that the surface emits, of which nothing was sampled, and of inner lights at it."""
+        # L += throughput L_e, and for the inner lights throughput f E
         emitter = si.emitter(self.scene)
         shines = si.is_valid() & (k != walk.object) & (emitter != None)  # noqa: E711
         L = record.L + dr.select(shines, walk.weight * emitter.eval(si, shines), 0)
@@ -197,24 +199,32 @@ class LightVisitor:
         return walk, replace(record, L=L)
 
     def crossing(self, walk: Walk, record: LightRecord, crossing: Crossing) -> tuple[Walk, LightRecord]:
+        # ---- the last vertex is the boundary, with the density of the direction that leaves it
         before = record
         record = replace(record, previous=crossing.si.p, pdf=crossing.pdf, delta=crossing.delta)
         if self.forward:
             record = replace(record, run=record.run.onward(crossing.along))
+
+        # ---- where something lies inside: what emitter sampling could reach, and inner lights in a cone
         if self.media.inner is not None:
             sampled = (self.media.index_of(crossing.si) < 0) & ~crossing.delta
             record = replace(record, delta=crossing.delta | ~crossing.leaves, scattered=record.scattered | sampled,
                              L=record.L + self.spread_inner_lights(walk, record.scattered & ~sampled))  # fmt: skip
+
+        # ---- index 1: the last vertex is still the event
         if self.straight_light is not None:
             record = self._from_event(walk, record, before, crossing)
         if self.connections is None:
             return walk, record
+
+        # ---- refracted straight from the event: connections and directions to emitters have seen this way
         straight = record.straight & crossing.leaves
         departure = replace(record.departure, ahead=crossing.along)
         return walk, replace(record, straight=straight, directed=record.directed & straight, departure=departure)
 
     def _from_event(self, walk: Walk, record: LightRecord, before: LightRecord, crossing: Crossing) -> LightRecord:
         """The record of a path that has left an object of index 1: its last vertex is still the event."""
+        # the event has sampled emitters along the first way out of its object, up to `reach`
         way, medium = before.departure, walk.medium
         first = before.delta  # way out since the event
         near = dr.norm(crossing.si.p - way.p) < self.straight_light.reach(way.object, way.p, medium)
@@ -252,10 +262,13 @@ class LightVisitor:
         self, walk: Walk, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool
     ) -> mi.Spectrum:
         """Light of the emitter that a smooth boundary mirrors, F L, which no random choice of reflection then meets."""
+        # the mirrored direction with its reflectance F
         ctx = mi.BSDFContext()
         ctx.type_mask = mi.BSDFFlags.DeltaReflection
         bs, value = bsdf.sample(ctx, si, 0.0, mi.Point2f(0), active)
         d, _ = sided(si, bs.wo)
+
+        # throughput F L_e of what it meets
         ray = ray_from(si, d, self.media.instance_scene.rounding(si))
         met = self.media.instance_scene.intersect(self.scene, ray, mi.RayFlags.All, active=active)
         emitter = met.emitter(self.scene, active)
@@ -271,6 +284,7 @@ class LightVisitor:
         """Light of a delta light whose cone holds the ray, where no other strategy finds it."""
         if self.small is None or self.small.n_delta == 0:
             return mi.Spectrum(0)
+        # ---- one of n delta lights, where no connection finds it
         n = self.small.n_delta
         which = mi.Int32(draw(n, walk.rng)) if n > 1 else dr.zeros(mi.Int32, dr.width(walk.o))
         left = self.left(record)
@@ -281,6 +295,8 @@ class LightVisitor:
             emitter = walk.o + w_0 * dr.norm(self.scene.bbox().extents())
             active &= ~(record.connected & self.connections.covers(which, emitter, w_0, record.pivot))
             directed = active & record.directed
+
+        # ---- n E / Ω within the cone, which is narrow where directions to emitters share the light
         radius = dr.select(directed, NARROW, opaque(WIDE * self.blur))
         ray = ray_of(walk.o, walk.d, walk.medium)
         L = self.small.spread(which, ray, radius, active)
@@ -371,6 +387,7 @@ class PathTracer:
         scores: PathScores | None = None,
     ) -> tuple[mi.Spectrum, mi.Bool, mi.Spectrum]:
         """Radiance along each ray, whether it shows anything, and the layer of emission; fills `exits` or `scores`."""
+        # ---- results of all rays, which lanes write when their path ends
         n = dr.width(rays)
         dr.eval(rays)
         lanes = min(lanes, n)
@@ -381,6 +398,8 @@ class PathTracer:
         scorer = ScoreVisitor(self.visitor, media, scores) if scores else None
         walker = Walker(media, scorer or visitor)
         total, step = (dr.opaque(mi.UInt32, v) for v in (n, lanes))  # kernels then serve images of any size
+
+        # ---- the parts of an iteration
 
         def begin(index: mi.UInt32, rng: mi.PCG32) -> CameraPath:
             path = _begin(rays, total, index, rng, media, bool(scores), self.visitor.forward)
@@ -413,6 +432,7 @@ class PathTracer:
             p = dr.if_stmt((p,), outside, self._outside, _same, label="outside")
             return (dr.if_stmt((p,), ~p.walk.alive, renew, _same),)
 
+        # ---- lanes take rays index, index + lanes, ... until none is left
         rng = generator(mi, lanes, pass_seed(*seed))
         start = begin(dr.arange(mi.UInt32, lanes), rng)
         with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):  # records the loop twice, for kernels no faster
@@ -430,7 +450,7 @@ class PathTracer:
         ray = ray_of(p.walk.o, p.walk.d, p.walk.medium)
         si = self.visitor.media.instance_scene.intersect(self.visitor.scene, ray, mi.RayFlags.All)
 
-        # ---- emission, with its MIS weight
+        # ---- emission: L += throughput L_e p_f / (p_f + p_e)
         first = p.depth == 0
         shown = ~first if self.hide_emitters else mi.Bool(True)
         L_e = self.visitor.met_emitter(p.walk, p.light, si, shown)
@@ -440,7 +460,7 @@ class PathTracer:
         L = L + self.visitor.spread_lights(p.walk, p.light, p.walk.alive)
         light = replace(p.light, L=L, connected=mi.Bool(False), directed=mi.Bool(False), precomputed=mi.Bool(False))
 
-        # ---- the surface
+        # ---- the surface, unless the path is as deep as it may get
         depth = p.depth + 1
         alive = si.is_valid() & (depth < mi.UInt32(self.max_depth))
         walk = replace(p.walk, alive=alive)
@@ -449,35 +469,35 @@ class PathTracer:
 
     def _bounce(self, p: CameraPath, si: mi.SurfaceInteraction3f) -> CameraPath:
         """A surface met from outside: next-event estimation, BSDF sampling, Russian roulette, the way on or in."""
-        # ---- BSDF or boundary
+        # ---- what masks leave: the boundary of object k or another BSDF
         walk, light, media, rng = p.walk, p.light, self.visitor.media, p.walk.rng
         k, bsdf = media.draw(si, walk.d, rng)
         translucent, near = k >= 0, dr.maximum(k, 0)
         si = media.seen(si, k, walk.d)
+        mute = mi.Bool(False)
         if media.objects:
-            boundary = media.boundary(near)
-            bsdf = dr.select(translucent, boundary if isinstance(boundary, mi.BSDFPtr) else mi.BSDFPtr(boundary), bsdf)
-        mute = translucent & ~media.row("reflects", near) if media.objects else mi.Bool(False)
+            bsdf = dr.select(translucent, media.boundary_pointer(near), bsdf)
+            mute = translucent & ~media.row("reflects", near)
         lit = ~mute
         if media.inner is not None:
             around = media.inner.around(si)
             encloses = ~translucent & (around >= 0) & media.inner.displaces(si) & (dr.dot(walk.d, si.n) > 0)
             lit &= ~encloses  # emitters on its other side are behind a medium
 
-        # ---- next-event estimation
+        # ---- next-event estimation: L += throughput f cos L_e / p_e  p_e / (p_e + p_f)
         L = light.L + self.visitor.sampled_emitter(walk, si, bsdf, lit, translucent)
 
         # ---- emitters in the mirror of a smooth boundary: F L(mirrored direction)
         mirrors, L, p = self._mirror(L, p, si, bsdf, near, translucent & lit)
 
-        # ---- BSDF sampling
+        # ---- BSDF sampling: throughput *= f cos / p_f
         bs, value = sample_bsdf(bsdf, si, rng)
         d, turned = sided(si, bs.wo)
         d, turned = dr.select(translucent, d, si.to_world(bs.wo)), turned & translucent
         enters = translucent & (dr.dot(d, si.n) < 0)
         weight, scale = walk.weight * value, walk.scale * dr.square(bs.eta)
 
-        # ---- Russian roulette
+        # ---- Russian roulette: survive with q = min(size, 0.95), throughput /= q
         size = dr.max(weight) * scale
         survive = survival(size, p.depth, self.rr_depth)
         weight = weight / dr.maximum(survive, 1e-30)
@@ -494,21 +514,21 @@ class PathTracer:
         if media.carried:  # the medium of the exit, for the whole walk
             new = alive & enters
             walk = replace(walk, medium=dr.select(new, media.fetch(near, si, new), walk.medium))
-        walk = replace(walk, o=o, d=d, off=off, alive=alive, order=dr.select(enters, 0, walk.order),
-                       object=dr.select(alive & enters, k, OUTSIDE), weight=weight, scale=scale,
-                       channel=channel)  # fmt: skip
+        walk = replace(walk, o=o, d=d, off=off, alive=alive, order=dr.select(enters, 0, walk.order), channel=channel,
+                       object=dr.select(alive & enters, k, OUTSIDE), weight=weight, scale=scale)  # fmt: skip
+
+        # ---- the last vertex for the MIS weight of emission; index 1 keeps the event
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | turned
-        scattered, again = light.scattered | ~delta, mi.Bool(False)  # still straight from the event
+        scattered, again = light.scattered | ~delta, mi.Bool(False)
         if self.visitor.straight_light is not None:
-            again = light.sighted & enters & self.visitor.straight_light.passes_again(near)
-            again &= k == light.departure.object
+            same = k == light.departure.object
+            again = light.sighted & enters & same & self.visitor.straight_light.passes_again(near)
         light = replace(light, L=L, previous=dr.select(again, light.previous, si.p), sighted=again,
                         pdf=dr.select(again, light.pdf, bs.pdf), delta=delta & ~again, scattered=scattered,
                         precomputed=mirrors & ~enters, run=light.run and light.run.ended())  # fmt: skip
         if media.inner is not None:
-            delta = ~again & (delta | enters | encloses)
             L = L + self.visitor.spread_inner_lights(walk, scattered & enters)
-            light = replace(light, delta=delta, L=L)
+            light = replace(light, delta=~again & (delta | enters | encloses), L=L)
         return replace(p, walk=walk, light=light)
 
     def _mirror(
@@ -542,6 +562,7 @@ def _begin(
     scored: bool = False,
     forward: bool = False,
 ) -> CameraPath:
+    """A path of the ray with this number, outside of all objects."""
     lanes, known = dr.width(index), index < total
     o, d = dr.gather(mi.Point3f, rays.o, index, known), dr.gather(mi.Vector3f, rays.d, index, known)
     no, first = dr.full(mi.Bool, False, lanes), dr.full(mi.UInt32, 0, lanes)
@@ -580,6 +601,7 @@ class FirstExits:
     @classmethod
     def of(cls, scene: mi.Scene, media: WalkMedia, rays: mi.Ray3f) -> FirstExits:
         """What rays of the camera meet first, and room for where their walks leave."""
+        # x_o and w_o; what walks leave by is stored as they do
         si = media.instance_scene.intersect(scene, rays, mi.RayFlags.All, coherent=True)
         k = media.index_of(si, si.is_valid())
         si = media.seen(si, k, rays.d)
@@ -642,6 +664,7 @@ class FirstExitVisitor:
 
     def crossing(self, walk: Walk, record: FirstExitRecord, crossing: Crossing) -> tuple[Walk, FirstExitRecord]:
         walk, kept = self.visitor.crossing(walk, record.record, crossing)
+        # x_i, w_i and T of a walk that leaves the object which its path has met first
         to, si = self.exits, crossing.si
         leaves, n_shading = walk.alive & crossing.leaves & record.first, lifted(si.sh_frame.n, si.n, walk.d)
         pairs = ((to.throughput, walk.weight), (to.x_i, si.p), (to.n_i, si.n), (to.n_i_shading, n_shading),

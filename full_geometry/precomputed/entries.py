@@ -1,4 +1,4 @@
-"""Places where light may enter, for exits at all points of a surface at once: what a transfer is summed over.
+"""Places where light may enter, for exits at all points of a surface at once: what a transport matrix is summed over.
 
 Uniform places of the surface are put in an order along it. Those for an exit at x are drawn in proportion to
 
@@ -47,6 +47,7 @@ class StratifiedEntries:
     @classmethod
     def of(cls, positions: PositionSampler, points: SurfacePoints, number: int, seed: int) -> StratifiedEntries:
         """`number` for each point, by the radial density of a sampler."""
+        # ---- places in the order of their points, and the tree over them
         rng, count, order = np.random.default_rng(seed), len(points), _order(points)
         rank = np.empty(count, dtype=np.int64)
         rank[order] = np.arange(count)
@@ -55,12 +56,15 @@ class StratifiedEntries:
         own = mi.UInt32(positions.geometry.piece(points.face, mi.Bool(True)))
         size, n = dr.opaque(mi.UInt32, dr.width(point)), dr.opaque(mi.UInt32, number)
 
+        # ---- W = Σ_k f(|x_k - x|) for the exit x of each point
         def add(k: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.Float]:
             f, end = tree.item(k, points.p, own)
             return end, dr.fma(f, mi.Float(end - k), total)
 
         start = dr.zeros(mi.UInt32, count)
         _, whole = dr.while_loop((start, mi.Float(0)), lambda k, _: k < size, add, label="sum over places")
+
+        # ---- entry s is where the cumulative sum passes (s + shift) W / n; its weight is W A / (f N)
         shift = np.empty(count, dtype=np.float32)  # neighbours have places between those of each other
         shift[order] = (np.arange(count) * GOLDEN + rng.random()) % 1.0
         shift, lanes = mi.Float(shift), dr.arange(mi.UInt32, count) * n
@@ -71,6 +75,7 @@ class StratifiedEntries:
         def choose(k: mi.UInt32, s: mi.UInt32, total: mi.Float) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
             f, end = tree.item(k, points.p, own)
             more, ahead, inverse = f * mi.Float(end - k), (mi.Float(s) + shift) * step - total, 1 / dr.maximum(f, 1e-30)
+            # within this item of even f, else on to the next one
             here = (ahead < more) | (end == size)
             within = dr.clip(ahead * inverse, 0, mi.Float(end - k - 1))
             dr.scatter(chosen, k + mi.UInt32(within), lanes + s, here)
@@ -97,6 +102,7 @@ def _order(points: SurfacePoints) -> np.ndarray:
     """Points by groups, along a tree of halves."""
     p = np.array(points.p).T
 
+    # cut across the longest side, to whole groups
     def halved(part: np.ndarray) -> list[np.ndarray]:
         part = part[np.argsort(p[part, np.ptp(p[part], axis=0).argmax()])]
         if len(part) <= GROUP:
@@ -115,6 +121,7 @@ def _places(
     at = uniform_entries(positions.geometry, u[0], mi.Point2f(u[1], u[2]))
     at = at._replace(weight=at.weight + dr.zeros(mi.Float, PLACES))
     point, known = (np.array(v) for v in points.nearest(at.p, at.n, mi.Bool(True)))
+    # those that a point is in reach of, point by point
     kept = np.flatnonzero(known)
     kept = kept[np.argsort(rank[point[kept]], kind="stable")]
     places = at.gather(mi.UInt32(kept.astype(np.uint32)))
@@ -151,7 +158,8 @@ class _Tree:
         places: EntrySample,
         point: np.ndarray,
     ) -> _Tree:
-        """Of places, with the place in the order of the point of each."""
+        """The tree of places; `point` is the rank of the point of each."""
+        # ---- middles and radii of groups; a group of several pieces of the surface is always divided
         p, of_point, group = np.array(points.p).T[order], np.arange(len(order)) // GROUP, point // GROUP
         n = np.bincount(of_point)
         middle = np.stack([np.bincount(of_point, x) / n for x in p.T], axis=1)
@@ -160,7 +168,9 @@ class _Tree:
         piece = positions.geometry.piece(places.face, mi.Bool(True)) + dr.zeros(mi.UInt32, len(point))
         number = np.array(piece)
         first = np.searchsorted(group, np.arange(len(n)))[group]
-        radius[group[number != number[first]]] = 1e15  # a group of several pieces is always divided
+        radius[group[number != number[first]]] = 1e15
+
+        # ---- where groups and points end in the order of places
         ends = [np.searchsorted(v, v, side="right") for v in (group, point)]
 
         def packed(x: np.ndarray, within: np.ndarray | float) -> mi.Float:
@@ -180,6 +190,7 @@ class _Tree:
     def item(self, k: mi.UInt32, x: mi.Point3f, piece: mi.UInt32) -> tuple[mi.Float, mi.UInt32]:
         """f of the places from k on for an exit at x of a piece, and the end of those of which it is that."""
         of, here = dr.gather(mi.Vector4u, self.of, k), mi.Bool(True)
+        # the group where it is far, else the point, else the place: the last level whose middle is not near enough
         d, end = mi.Float(0), of.z
         for level, index, last in ((self.groups, of.x, of.z), (self.points, of.y, of.w), (self.places, k, k + 1)):
             v = dr.gather(mi.Vector4f, level, index, here)

@@ -75,6 +75,7 @@ class Events:
     @classmethod
     def of(cls, obj: TranslucentObject, count: int) -> Events | None:
         """`count` events of an object; None where a grid of so few nodes would not resolve their depth."""
+        # ---- the finest grid with at most `MOST` occupied cells
         p, n = _places(obj, count)
         x, mfp = np.array(p, dtype=float).T, 1 / np.mean([float(m.sigma_t) for m in obj.media])
         h = WIDTH * mfp
@@ -82,6 +83,8 @@ class Events:
             h *= max((cells / MOST) ** 0.4, 1.02)
         if h > WIDEST * mfp:
             return None
+
+        # ---- events in the order of their cells
         low = x.min(axis=0) - 0.5 * h
         counts = np.floor((x.max(axis=0) - low) / h).astype(int) + 2
         cell = np.floor((x - low) / h).astype(int)
@@ -89,6 +92,8 @@ class Events:
         lanes = mi.UInt32(order.astype(np.uint32))
         p, n = dr.gather(mi.Point3f, p, lanes), dr.gather(mi.Normal3f, n, lanes)
         dr.eval(p, n)
+
+        # ---- trilinear weights of the nodes about each event, and the nodes that have enough of it
         x, cell = (x[order] - low) / h, cell[order]
         weights = _weights(x - cell, cell, counts)
         kept = np.flatnonzero(weights.sum(axis=1) >= LEAST)
@@ -99,9 +104,12 @@ class Events:
     @cached_property
     def _planes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Positions of events in h; of nodes the sums of weights, means of positions, inverse covariances."""
+        # Σ w, E[x] of each node
         x = (np.array(self.p, dtype=float).T - self.low) / self.h
         whole = np.asarray(self.weights.sum(axis=1)).ravel()
         middle = (self.weights @ x) / whole[:, None]
+
+        # C = E[x x^T] - E[x] E[x]^T, with a ridge where events are few
         i, k = (v.ravel() for v in np.indices((3, 3)))
         C = (self.weights @ (x[:, i] * x[:, k]) / whole[:, None]).reshape(-1, 3, 3)
         C -= middle[:, :, None] * middle[:, None, :]
@@ -111,6 +119,7 @@ class Events:
     def fitted(self, values: np.ndarray) -> np.ndarray:
         """Planes (nodes, components, 4) of values (events, components): constant, and slope by position over h."""
         x, whole, middle, inverse = self._planes
+        # slope = C^-1 (E[v x] - E[v] E[x]), constant = E[v] - slope.E[x]
         mean = (self.weights @ values) / whole[:, None]
         both = np.stack([self.weights @ (values * x[:, i : i + 1]) for i in range(3)], axis=2) / whole[:, None, None]
         slope = np.einsum("nci,nij->ncj", both - mean[:, :, None] * middle[:, None, :], inverse)
@@ -132,6 +141,8 @@ def _places(obj: TranslucentObject, count: int) -> tuple[mi.Point3f, mi.Normal3f
     u = [mi.Float(v[order].astype(np.float32)) for v in u]
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(11, count)
+
+    # rays that enter uniformly over the surface, by the cosine, refracted inwards
     entry = uniform_entries(obj.geometry, u[0], mi.Point2f(u[1], u[2]))
     w, _ = cosine_above(entry.n_out, entry.n, sampler.next_2d())
     d, _, valid = refract_in(surface_point(entry.p, entry.n, entry.n_out, w), obj.eta)
@@ -139,6 +150,8 @@ def _places(obj: TranslucentObject, count: int) -> tuple[mi.Point3f, mi.Normal3f
     ray = ray_from(place(entry.p, entry.n), d, obj.geometry.clearance)
     wall = obj.geometry.scene.ray_intersect_preliminary(ray, False, True)
     length = dr.select(wall.is_valid(), wall.t, opaque(obj.geometry.rounding))
+
+    # s = -ln(1 - u (1 - exp(-sigma_t length))) / sigma_t, for the channels in turn
     sigma = mi.Float(0)
     for c, medium in enumerate(obj.media):
         sigma = dr.select(k % len(obj.media) == c, opaque(medium.sigma_t), sigma)
@@ -150,6 +163,7 @@ def _places(obj: TranslucentObject, count: int) -> tuple[mi.Point3f, mi.Normal3f
 
 def _weights(f: np.ndarray, cell: np.ndarray, counts: np.ndarray) -> csr_array:
     """Weights (all nodes, events) for places f in their cells."""
+    # corner (i, j, k) has Π f or 1 - f over the axes
     rows, values, along = [], [], ((1 - f).T, f.T)
     for i, j, k in np.ndindex(2, 2, 2):
         rows.append(((cell[:, 2] + k) * counts[1] + cell[:, 1] + j) * counts[0] + cell[:, 0] + i)
@@ -185,10 +199,13 @@ class InnerLight:
         """J(p, d), 0 where no event was near."""
         size, number = dr.size_v(mi.Spectrum), (self.bands + 1) ** 2
         grid = self.events
+        # ---- the cell, and the place in it
         x = [(p[a] - opaque(grid.low[a])) * opaque(1 / grid.h) for a in range(3)]
         cell, counts = [mi.Int32(dr.floor(v)) for v in x], [dr.opaque(mi.Int32, int(n)) for n in grid.counts]
         f, homogeneous = [v - mi.Float(c) for v, c in zip(x, cell)], mi.Vector4f(1, *x)
         total, whole = [mi.Float(0)] * (size * number), mi.Float(0)
+
+        # ---- Σ over corners of the trilinear weight times the plane of that node
         for corner in np.ndindex(2, 2, 2):
             at = [c + k for c, k in zip(cell, corner)]
             inside = active
@@ -204,6 +221,8 @@ class InnerLight:
             for b in range(size * number):
                 plane = dr.gather(mi.Vector4f, self.planes, node * (size * number) + b, known)
                 total[b] = dr.fma(w, dr.dot(plane, homogeneous), total[b])
+
+        # ---- J = Σ_lm g^l Y_lm(d) times these
         scale = dr.select(whole > 0, dr.rcp(dr.maximum(whole, 1e-30)), 0)
         Y, J = dr.sh_eval(d, self.bands), []
         for c in range(size):

@@ -61,15 +61,20 @@ def lit_pairs(brought: np.ndarray, point: np.ndarray, rays: Rays) -> LitPairs:
         point: that each is nearest to.
         rays: to points.
     """
+    # ---- n entries of each point, of probability (1 - ANY) light / Σ light + ANY / entries
     (rows, each), n = brought.shape, max(COUNT // len(brought), FEWEST)
     row = np.repeat(np.arange(rows), n)
     by_light = np.maximum(brought, 0) / np.maximum(np.maximum(brought, 0).sum(axis=1, keepdims=True), 1e-30)
     probability = (1 - ANY) * by_light + ANY / each
     number = _systematic(probability, row, (np.arange(rows)[:, None] * GOLDEN % 1.0 + np.arange(n)).ravel() / n)
+
+    # ---- a stratified uniform number for each of the pairs with entries at one point, in random order
     at = point.ravel()[number]
     order = np.lexsort((np.random.default_rng(rows).random(len(at)), at))
     sorted_at, u = at[order], np.empty(len(at))
     u[order] = (np.arange(len(at)) - np.searchsorted(sorted_at, sorted_at) + 0.5) / np.bincount(at)[sorted_at]
+
+    # ---- a ray of light to that point in proportion to its light, and its colour over that of all
     ray = _systematic(rays.light.mean(axis=2), at, u)
     light, mean = rays.light.reshape(-1, rays.light.shape[2])[ray], rays.light.sum(axis=1)[at]
     colour = light * (mean.mean(axis=1) / np.maximum(light.mean(axis=1), 1e-30))[:, None] / np.maximum(mean, 1e-30)
@@ -79,6 +84,7 @@ def lit_pairs(brought: np.ndarray, point: np.ndarray, rays: Rays) -> LitPairs:
 
 def _systematic(weights: np.ndarray, row: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Numbers of items of rows (rows, items), in proportion to their weights, for uniform numbers."""
+    # one cumulative sum over all rows; u of a row is looked up between its ends
     summed = np.cumsum(np.maximum(weights, 0), axis=1, dtype=float)
     whole, n = summed[:, -1].copy(), weights.shape[1]
     before = np.concatenate([[0], np.cumsum(whole)[:-1]])
@@ -103,11 +109,14 @@ class EntryPairs(NamedTuple):
 
     def S(self, lit: LitPairs) -> tuple[np.ndarray, np.ndarray]:
         """S over the density of entries, (pairs, channels), and the cosines of light; both 0 below the surface."""
+        # the exit along w_o, the entry with light along w
         obj, on = self.object, mi.Bool(True)
         w_o = self.w_o[lit.row, lit.number % self.w_o.shape[1]]
         row, number, w_o, w = mi.UInt32(lit.row), mi.UInt32(lit.number), mi.Vector3f(w_o.T), mi.Vector3f(lit.w.T)
         entry = self.entries(number)
         at, prepared = entry.facing(w), obj.transport.prepare(self.out(row, w_o)[0], on)
+
+        # S(x_i, w; x_o, w_o) over the density of the entry
         active = (dr.dot(w, entry.n) > 0) & (entry.weight > 0)
         S = mi.Spectrum(dr.select(active, obj.transport.S(prepared, at, active) * entry.weight, 0))
         mu = dr.select(active, at.mu, 0)

@@ -15,7 +15,7 @@ import numpy as np
 
 from full_geometry.geometry.instances import InstanceScene, bounds_of
 from full_geometry.geometry.rounding import ray_from
-from full_geometry.precomputed.transfer import R_2
+from full_geometry.precomputed.transport_matrix import R_2
 from full_geometry.surface.wrapped import surface_of
 
 LAUNCH, LAUNCHES = 2**16, 16  # rays of a look at the scene, and the most looks for an object that is hardly seen

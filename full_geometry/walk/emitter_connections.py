@@ -102,6 +102,7 @@ class SubpathConnections:
 
         The line must cross the plane through the pivot steeply on its way from the emitter.
         """
+        # |w.w_0| > `STEEPEST`, from an emitter that looks small and is on the other side of the plane
         near = dr.maximum(k, 0)
         w_0, small = self.small.direction(near, pivot)
         cosine = dr.dot(w, w_0)
@@ -110,6 +111,7 @@ class SubpathConnections:
 
     def light(self, event: Event, rng: mi.PCG32) -> tuple[mi.Spectrum, Score | tuple[()], mi.PCG32]:
         """Light of connections at an event per weight of the walk from the camera, its slopes, and the generator."""
+        # ---- one of n emitters, and with the probability share * promise a light subpath from it
         n = len(self.small)
         which = draw(n, rng)
         w_0, small = self.small.direction(which, event.p)
@@ -117,6 +119,8 @@ class SubpathConnections:
         chosen = small & (rng.next_float32() < self.share * survive)
         lanes = dr.width(event.p)
         L, slopes = mi.Spectrum(0) + dr.zeros(mi.Spectrum, lanes), Score.sums(lanes) if self.scored else ()
+
+        # ---- L n / (share promise)
         state = (rng, L, slopes, event, sample)
         rng, L, slopes, *_ = dr.if_stmt(state, chosen, self._enter, lambda *state: state, label="connection")
         factor = n / (self.share * survive)
@@ -124,6 +128,7 @@ class SubpathConnections:
 
     def _sample_emitter(self, which: mi.UInt32, w_0: mi.Vector3f, event: Event) -> tuple[EmitterSample, mi.Float]:
         """Where light of an emitter enters towards an event, and the probability to look for it, (0, 1]."""
+        # ---- the boundary between the event and the emitter, its normal n and its distance
         p, k, m = event.p, event.object, event.m
         ray = mi.Ray3f(p, w_0)
         ray.maxt = DEEPEST / dr.min(m.mean_t)
@@ -131,11 +136,15 @@ class SubpathConnections:
         n = si.n * self.media.side(k, si.prim_index)
         facing = si.is_valid() & (dr.dot(n, w_0) > 0)
         far = dr.select(si.is_valid(), si.t, ray.maxt)
+
+        # ---- where a plane boundary would refract its light towards p: along w_0 / eta + n (cos_t - cos / eta)
         _, cos_t, _, eta_ti = mi.fresnel(dr.select(facing, dr.dot(n, w_0), 1), self.media.row("eta", k))
         back = w_0 * eta_ti + n * (dr.abs(cos_t) - eta_ti * dr.dot(n, w_0))  # from p to where the light enters
         entry = back * (dr.dot(n, w_0) * far / dr.maximum(dr.abs(cos_t), 1e-3))
         shift = dr.select(facing, entry - w_0 * dr.dot(entry, w_0), 0)
         depth = dr.select(facing, dr.minimum(dr.norm(entry), far), far)
+
+        # ---- the deeper, the less light: a probability of exp(-sigma_t depth / 2)
         promise = dr.maximum(dr.exp(-0.5 * dr.min(m.mean_t) * depth), LEAST_PROMISE)
         return EmitterSample(which, w_0, mi.Vector3f(shift), depth), promise
 
@@ -143,7 +152,7 @@ class SubpathConnections:
         self, rng: mi.PCG32, L: mi.Spectrum, slopes: Score | tuple[()], event: Event, sample: EmitterSample
     ) -> tuple:
         """Sample a ray of light, refract it into the object and follow it."""
-        # ---- a ray from the emitter to a point near the event
+        # ---- a ray from the emitter through a point a of the plane: flux L |w.w_0| / (p(a) p(w))
         k, m = event.object, event.m
         at, density = _draw_across(event, sample, rng)
         which = sample.emitter
@@ -157,7 +166,7 @@ class SubpathConnections:
         steep = dr.abs(dr.dot(w, sample.w_0)) > STEEPEST
         enters = si.is_valid() & (dr.max(light) > 0) & steep & (self.media.index_of(si) == mi.Int32(k))
 
-        # ---- refraction at the boundary
+        # ---- refraction at the boundary: flux *= (1 - F) and by how much the ray is widened there
         si = self.media.face_outwards(si, dr.select(enters, mi.Int32(k), -1), -w)
         si.wi = dr.select(mi.Frame3f.cos_theta(si.wi) < 0, -si.wi, si.wi)  # below its horizon, see `geometry.points`
         F, cos_t, _, eta_ti = mi.fresnel(mi.Frame3f.cos_theta(si.wi), self.media.row("eta", k))
@@ -168,7 +177,7 @@ class SubpathConnections:
         weight = dr.select(enters, flux * ((1 - F) * bend), 0)
         enters &= dr.max(weight) > 0
 
-        # ---- the walk from there
+        # ---- the walk from there, with the medium of the walk from the camera
         walk = start_walk(mi.Point3f(si.p), d, rng, event.medium)
         walk = replace(walk, off=self.media.clear(k, si.n, d), alive=enters, object=k, weight=weight,
                        channel=draw(len(m.sigma_t), rng))  # fmt: skip
@@ -179,8 +188,8 @@ class SubpathConnections:
 
     def _follow(self, s: LightSubpath, event: Event) -> tuple[LightSubpath, Event]:
         """One flight of the light subpath, and a connection on its ray if that may have one."""
+        # ---- an event q at the distance t on the ray, of density D / (dtheta (D² + (t - t_0)²)), and its connection
         media, walk, rng = self.media, s.walk, s.walk.rng
-        # ---- connection of an event q on the ray
         m = media.coefficients(event.object, walk.o, event.medium)
         connectable = s.lit & s.fresh
         t, over = _on_ray(walk, event, rng.next_float32())
@@ -197,10 +206,14 @@ class SubpathConnections:
         if media.varies:
             m, u = media.coefficients(event.object, p, event.medium), rng.next_float32()
         ended = fly(m, walk.weight, walk.density, walk.channel, flight, reach, u)
+
+        # ---- scattered by the phase function; no connection until it has been reflected
         u = mi.Point2f(rng.next_float32(), rng.next_float32())
         turned, weight, density = turn(m, ended.weight, ended.density, walk.channel, walk.d, u, media.same_g)
         scattered = replace(walk, alive=walk.alive & s.lit, o=p, d=turned, weight=weight,
                             density=density, off=media.behind(event.object, turned))  # fmt: skip
+
+        # ---- or on after a null collision, or reflected at the boundary
         walk = replace(walk, weight=ended.weight, density=ended.density)
         if media.varies:
             on = walk.alive & (~ended.null | media.box.contains(p))
@@ -209,6 +222,8 @@ class SubpathConnections:
         state = (walk, ~ended.scatters & s.lit, ray, hit)
         walk, lit, *_ = dr.if_stmt(state, ~(ended.scatters | ended.null), self._reflect, lambda *state: state)
         scattered.rng = walk.rng
+
+        # ---- n, d and d log p / dg of the subpath so far, for derivatives
         score = s.score and s.score + Score(
             dr.select(ended.scatters, mi.Float(1), 0), dr.minimum(flight, reach),
             dr.select(ended.scatters, phase_score(m.g, dr.dot(s.walk.d, turned)), 0))  # fmt: skip
@@ -219,6 +234,7 @@ class SubpathConnections:
 
         `over` is one over the density of t.
         """
+        # ---- weight sigma_s(q) p(cos_p) p(cos_q) / density of t; |p - q|² has cancelled
         media, q = self.media, mi.Point3f(walk.o + walk.d * t)
         e, between = media.row("rounding", event.object), event.p - q
         to_p = mi.Ray3f(q, dr.normalize(between))
@@ -228,9 +244,13 @@ class SubpathConnections:
         phases = eval_phase(event.m, cosines[0]) * eval_phase(event.m, cosines[1])
         value = dr.select(over > 0, walk.weight * at_q.sigma_s * phases * over, 0)
         bright = dr.max(value) > 0
-        clear = mi.Ray3f(mi.Point3f(q + to_p.d * e), to_p.d)  # of what rounding has put beyond the boundary
+
+        # ---- visibility between both events, clear of what rounding has put beyond the boundary
+        clear = mi.Ray3f(mi.Point3f(q + to_p.d * e), to_p.d)
         clear.maxt = to_p.maxt - 2 * e
         bright &= ~blocked(media.scene, clear, bright)
+
+        # ---- transmittance along the ray to q and from q to p
         to_q, medium = mi.Ray3f(walk.o, walk.d), event.medium
         T = media.transmittance(event.object, to_q, dr.select(bright, t, 0), walk.rng, medium)
         T *= media.transmittance(event.object, to_p, dr.select(bright, to_p.maxt, 0), walk.rng, medium)
@@ -242,6 +262,7 @@ class SubpathConnections:
 
     def _reflect(self, walk: Walk, lit: mi.Bool, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f) -> tuple:
         """Reflection at the boundary from inside with the probability of its reflectance, after which a ray is lit."""
+        # ---- the mirrored direction, and its reflectance F
         k, d = mi.Int32(walk.object), walk.d
         si = self.media.instance_scene.interaction(hit, ray, mi.RayFlags.All)
         si = self.media.seen(si, k, d)
@@ -249,6 +270,8 @@ class SubpathConnections:
         new, _ = sided(si, mi.reflect(si.wi))
         passes = (self.media.met(si, k) != k) | (dr.dot(si.n, d) < 0)  # as of `Walker`
         new = dr.select(passes, d, new)
+
+        # ---- reflected with the probability F, else the subpath ends
         inside = (dr.dot(si.n, new) < 0) & (walk.rng.next_float32() < F)
         o, off = self.media.depart(si, new, mi.Bool(True))
         walk = replace(walk, o=o, d=new, off=off, alive=walk.alive & (passes | inside))
@@ -257,6 +280,7 @@ class SubpathConnections:
 
 def _draw_across(event: Event, sample: EmitterSample, rng: mi.PCG32) -> tuple[mi.Interaction3f, mi.Float]:
     """A point of the plane across w_0 through the event, and its density per area."""
+    # the distance r by c exp(-c r), of one of two rates and of one of the channels; density / (2 pi r) per area
     sigma_t = event.m.mean_t
     wide = sigma_t * dr.rsqrt(1 + sigma_t * sample.depth)
     rate = dr.select(rng.next_float32() < 0.5, RATES[0], RATES[1]) * pick(wide, draw(len(wide), rng))
@@ -269,6 +293,7 @@ def _draw_across(event: Event, sample: EmitterSample, rng: mi.PCG32) -> tuple[mi
 
 def _on_ray(walk: Walk, event: Event, u: mi.Float) -> tuple[mi.Float, mi.Float]:
     """Distance of an event q on a ray of light, and 1 / (its density |p - q|²)."""
+    # equiangular: theta uniform between the start of the ray and its end, t = t_0 + D tan(theta)
     v = event.p - walk.o
     t_0 = dr.dot(v, walk.d)
     D = dr.maximum(dr.norm(v - walk.d * t_0), 1e-9)
@@ -335,6 +360,7 @@ class EmitterDirections:
         self, v: mi.Point3f, k: mi.Int32, which: mi.Int32, m: Coefficients, active: mi.Bool
     ) -> tuple[mi.Vector3f, mi.Float, mi.Bool]:
         """The direction from v by which an emitter sees it through the boundary, its concentration, and if any."""
+        # ---- iterate: w to the emitter from where the last guess meets the boundary, refracted there
         toward, small = self.small.direction(which, v)
         eta = self.media.row("eta", k)
         valid, d, w = active & small, toward, toward
@@ -349,15 +375,20 @@ class EmitterDirections:
             _, cos_t, _, eta_ti = mi.fresnel(dr.clip(cosine, 0, 1), eta)
             refracted = w * eta_ti + n * (dr.abs(cos_t) - eta_ti * cosine)
             d = dr.normalize(dr.select(cosine > 0, refracted, d))
+
+        # ---- a lobe as wide as the emitter is seen inside: concentration eta² / angle²
         return d, dr.minimum(dr.square(eta) / dr.maximum(self.small.angle2(which, v), 1e-6), 1e6), valid
 
     def light(self, event: Event, rng: mi.PCG32) -> tuple[mi.Spectrum, Score | tuple[()]]:
         """An estimate of the light of small emitters that leaves from an event, per weight of the walk; its slopes."""
+        # ---- one of n emitters, and a direction d about the guessed one
         v, k, m = event.p, event.object, event.m
         n = len(self.small)
         which = mi.Int32(draw(n, rng))
         guess, concentration, valid = self._guess(v, k, which, m, True)
         d, pdf = _draw_lobe(guess, concentration, rng)
+
+        # ---- where it leaves the object, refracted to w outside, with the transmittance 1 - F
         ray = ray_of(v, d, event.medium)
         ray.maxt = 2 * DEEPEST / dr.min(m.mean_t)
         si = self.media.instance_scene.intersect(self.media.scene, ray, mi.RayFlags.All, active=valid)
@@ -368,8 +399,10 @@ class EmitterDirections:
         valid &= (dr.dot(d, si.n) > 0) & (dr.dot(w, si.n) > 0) & (F < 1)
         way = ray_from(si, w, self.media.instance_scene.rounding(si))
         outside = self.media.instance_scene.intersect(self.scene, way, mi.RayFlags.All, active=valid)
+
+        # ---- p(cos) T (1 - F) L / eta² over the mixture density of lobes and phase function (balance heuristic);
+        #      radiance shrinks by eta² on its way out, as the weight of the walk has when it came in
         phase = eval_phase(m, dr.dot(event.along, d))
-        # radiance shrinks by eta² on its way out, as the weight of the walk has when it came in
         factor = (1 - F) * dr.square(eta_ti) / (pdf / n + channel_mean(phase))
         T = self.media.transmittance(k, ray, dr.select(valid, si.t, 0), rng, event.medium)
         value = phase * T * factor
@@ -381,6 +414,7 @@ class EmitterDirections:
 
     def share(self, which: mi.Int32, way: Departure, active: mi.Bool, medium: WalkMedium | tuple[()] = ()) -> mi.Float:
         """Weight of having hit emitter `which`, if >= 0, by the phase function (balance heuristic against `light`)."""
+        # p_phase / (p_phase + p_lobes)
         k, m = way.object, self.media.coefficients(way.object, way.p, medium)
         guess, concentration, valid = self._guess(way.p, k, type(k)(dr.maximum(which, 0)), m, active & (which >= 0))
         lobes = _lobes(dr.dot(guess, way.ahead), concentration) / len(self.small)
@@ -397,6 +431,7 @@ def _lobes(cosine: mi.Float, concentration: mi.Float) -> mi.Float:
 
 def _draw_lobe(guess: mi.Vector3f, concentration: mi.Float, rng: mi.PCG32) -> tuple[mi.Vector3f, mi.Float]:
     """A direction about the guess, and its density."""
+    # 1 - cos by c exp(-c (1 - cos)) of one of the lobes, phi uniform
     u = rng.next_float32()
     c = dr.select(u < SHARES[0], concentration, dr.select(u < SHARES[0] + SHARES[1], WIDER[0], WIDER[1]))
     x = dr.minimum(-dr.log(1 - rng.next_float32()) / c, 2)
@@ -465,10 +500,13 @@ class InnerLights:
         medium: WalkMedium | tuple[()] = (),
     ) -> tuple:
         """The direction to a light from an interaction in object k, and its irradiance across, over its probability."""
+        # one of n lights, n E
         emitter, here = self._drawn(k, rng, active)
         ds, E = emitter.sample_direction(at, mi.Point2f(0.5), here)
         lit = here & (ds.pdf > 0) & (dr.max(E) > 0)
         ray = ray_from(at, ds.d, place_bound(at.p))
+
+        # E(d) d² / I: 3 d² / r² (1 + sigma_t r / 4) within r, 1 beyond; times the transmittance
         sigma_t = medium.sigma_t if medium else self.media.spectrum("sigma_t", k)
         r = NEAREST / dr.max(sigma_t)
         near = dr.select(ds.dist < r, 3 * dr.square(ds.dist / r) * (1 + 0.25 * r * sigma_t), 1)
@@ -480,6 +518,7 @@ class InnerLights:
         self, k: mi.Int32, ray: mi.Ray3f, rng: mi.PCG32, active: mi.Bool, medium: WalkMedium | tuple[()] = ()
     ) -> mi.Spectrum:
         """Radiance of a light along a ray in object k, spread over a wide cone, over its probability."""
+        # n E / Ω within the cone, times the transmittance to the light
         emitter, here = self._drawn(k, rng, active)
         L = spread(self.media.inner.scene, emitter, ray, opaque(CONE * self.blur), here)
         at = dr.zeros(mi.Interaction3f)

@@ -69,6 +69,7 @@ class InclusionTable:
         result = find_inclusions(scene, objects)
         if not result:
             return None
+        # ---- what displaces the medium around it holds things of its own: these are looked for again
         groups = shown_groups(scene)
         own = InstanceTable.of([obj.shape for obj in objects], groups)
         _check(result, objects, own)
@@ -78,11 +79,15 @@ class InclusionTable:
                 raise ValueError(f"what refracts inside an object must be closed, got the shape {piece.name}")
         if glass:
             result = find_inclusions(scene, [*objects, *glass])
+
+        # ---- number shapes inside after the objects, each at all its places
         holders = InstanceTable.of([obj.shape for obj in (*objects, *glass)], groups)
         inside = [inclusion for inclusion in result if inclusion.object < len(own)]
         things = [thing for thing in _shapes(inside) if not any(thing is shape for shape in own.shapes)]
         instance_table = InstanceTable.of([*own.shapes, *things], groups)
         first = {id(shape): int(number) for shape, number in zip(instance_table.shapes, instance_table.first)}
+
+        # ---- what is around each: the smallest holder comes last and stays
         around, lights = np.full(len(instance_table), -1), {}
         holding, held = np.zeros(len(own), dtype=bool), np.zeros(len(instance_table), dtype=bool)
         for inclusion in _largest_first(result, holders):
@@ -93,6 +98,8 @@ class InclusionTable:
                 place = first[id(inclusion.node)] + inclusion.rank
                 around[place], held[place] = number, held[place] or number >= 0
             holding[[number] if number >= 0 else []] = True
+
+        # ---- tables of the kernel
         displaces = [_displaces(shape) for shape in instance_table.shapes]
         alone = ~holding & ~held[: len(own)]
         tables = {"around": mi.Int32(around.tolist()), "alone": mi.Bool(alone.tolist())}
@@ -188,7 +195,7 @@ class HeterogeneousMedia:
 
     @classmethod
     def of(cls, specs: list[MediumSpec], mm_per_unit: float) -> HeterogeneousMedia:
-        """Of the insides of objects."""
+        """The media of objects with these specs."""
         media = [inside.varying or _homogeneous(inside.medium) for inside in specs]
         tables = (
             per_channel([m.factor for m in media], mm_per_unit),
@@ -199,7 +206,7 @@ class HeterogeneousMedia:
         return cls([m.density for m in media], [m.albedo_volume for m in media], *tables)
 
     def majorant(self, k: mi.Int32) -> mi.Spectrum:
-        """Of object k, 1/(scene unit)."""
+        """The majorant of object k, 1/(scene unit)."""
         return _row(self.majorants, k)
 
     def sigma_t(self, k: mi.Int32, p: mi.Point3f) -> mi.Spectrum:
@@ -217,6 +224,7 @@ class HeterogeneousMedia:
         Collisions are drawn by the largest majorant M of the channels; each is null, with the weight
         1 - sigma_t,c / M (Novak, Selle and Jarosz 2014).
         """
+        # the first collision, t = -ln(1 - u) / M
         M = dr.max(self.majorant(k))
         o, d = mi.Point3f(ray.o), mi.Vector3f(ray.d)
         T = dr.full(mi.Spectrum, 1, dr.width(o))
@@ -232,6 +240,7 @@ class HeterogeneousMedia:
             M: mi.Float,
             distance: mi.Float,
         ) -> tuple:
+            # T *= 1 - sigma_t / M at the collision, then the next one
             T = T * dr.maximum(1 - self.sigma_t(k, dr.fma(d, t, o)) / M, 0)
             return t - dr.log(1 - rng.next_float32()) / M, T, rng, o, d, k, M, distance
 
@@ -272,7 +281,7 @@ _MOST = {"total": 2**31 - 1, "multiple": 2**31 - 1, "single": 1}
 
 
 class Coefficients(NamedTuple):
-    """Of the medium at a point in each lane: 1/(scene unit) and mean cosine, one value per channel."""
+    """Coefficients of the medium at a point in each lane: 1/(scene unit) and mean cosine, one value per channel."""
 
     sigma_t: mi.Spectrum
     sigma_s: mi.Spectrum
@@ -355,6 +364,7 @@ class WalkMedia:
     instance_scene: InstanceScene = InstanceScene([], {})
 
     def __post_init__(self) -> None:
+        # ---- coefficients by the number of an object, 1/(scene unit)
         instance_table = InstanceTable.of([obj.shape for obj in self.objects], self.shown)
         object.__setattr__(self, "instance_table", instance_table)
         specs, boundaries = ([rows[kind] for kind in instance_table.kind] for rows in (self.specs, self.boundaries))
@@ -363,10 +373,14 @@ class WalkMedia:
             scale = 1.0 if key == "g" else self.mm_per_unit
             tables[key] = per_channel([getattr(m, key) for m in media], scale)
         tables["eta"] = mi.Float([m.eta for m in media])
+
+        # ---- sides of geometric normals: one per shape, or one per face
         sides = [[obj.sign] if obj.signs is None else np.array(obj.signs).tolist() for obj in self.objects]
         tables["side"] = mi.Float(sum(sides, []))
         tables["first"] = mi.UInt32(np.cumsum([0, *map(len, sides)])[instance_table.kind].tolist())
         tables["step"] = mi.UInt32([int(len(sides[kind]) > 1) for kind in instance_table.kind])
+
+        # ---- orders, and what boundaries are like
         tables["fewest"] = mi.UInt32([_FEWEST[inside.orders] for inside in specs])
         tables["most"] = mi.UInt32([_MOST[inside.orders] for inside in specs])
         tables["rounding"] = mi.Float(instance_table.rounding.tolist())
@@ -378,7 +392,9 @@ class WalkMedia:
         numbers = pointer_numbers([mi.BSDFPtr(b) for b in self.boundaries])
         tables["boundary"] = mi.UInt32([numbers[kind] for kind in instance_table.kind])
         tables["kind"] = mi.UInt32(instance_table.kind.tolist())
-        dr.make_opaque(tables)  # one kernel for all media
+
+        # ---- as data of a kernel, which then serves all media
+        dr.make_opaque(tables)
         object.__setattr__(self, "tables", tables)
         object.__setattr__(self, "any_straight", any(straight))
         object.__setattr__(self, "box", _bounds(self.scene))
@@ -498,7 +514,8 @@ class WalkMedia:
         return WalkMedium(*(dr.full(mi.Spectrum, 1, lanes) for _ in range(2)), g, wavelengths, place)
 
     def coefficients(self, k: mi.Int32, p: mi.Point3f, medium: WalkMedium | tuple[()] = ()) -> Coefficients:
-        """Of object k at the point p, for a walk that took `medium` from `fetch`."""
+        """Coefficients of object k at the point p, for a walk that took `medium` from `fetch`."""
+        # homogeneous: of the walk where it carries a medium, else of the object
         mean, g = self.spectrum("sigma_t", k), self.spectrum("g", k)
         if self.heterogeneous is None:
             if medium:
@@ -506,6 +523,8 @@ class WalkMedia:
                     medium.sigma_t, medium.sigma_s, medium.g if len(medium.g) else g, medium.sigma_t, medium.sigma_t
                 )
             return Coefficients(mean, self.spectrum("sigma_s", k), g, mean, mean)
+
+        # heterogeneous: sigma_t(p), sigma_s(p) and the majorant, but for objects with textures
         sigma_t, sigma_s = self.heterogeneous.coefficients(k, p)
         result = Coefficients(sigma_t, sigma_s, g, self.heterogeneous.majorant(k), mean)
         if not medium:
@@ -543,6 +562,11 @@ class WalkMedia:
             return self.boundaries[0]
         return dr.reinterpret_array(mi.BSDFPtr, dr.gather(mi.UInt32, self.tables["boundary"], k))
 
+    def boundary_pointer(self, k: mi.Int32) -> mi.BSDFPtr:
+        """The dielectric of object k as a pointer."""
+        boundary = self.boundary(k)
+        return boundary if isinstance(boundary, mi.BSDFPtr) else mi.BSDFPtr(boundary)
+
     def side(self, k: mi.Int32, prim_index: mi.UInt32) -> mi.Float:
         """1 where the geometric normal of a face of object k points outwards, -1 where it points inwards."""
         if all(obj.signs is None for obj in self.objects):
@@ -564,6 +588,7 @@ class WalkMedia:
 
         A walk that began where its ray begins would lie deeper, so that light that is scattered once were lost.
         """
+        # inside it begins at the surface and its ray `off` from there, outside clear of the surface
         off = clear(si.n, d, self.instance_scene.rounding(si))
         return dr.select(inside, si.p, mi.Point3f(si.p + off)), dr.select(inside, off, 0)
 
@@ -581,6 +606,7 @@ class WalkMedia:
         self, si: mi.SurfaceInteraction3f, k: mi.Int32, direction: mi.Vector3f
     ) -> mi.SurfaceInteraction3f:
         """The interaction with its normals turned to the outside of object k; `direction` is that of the ray."""
+        # normal and bump maps, then the side of geometric and shading normal
         for number, around in enumerate(self.wrappings):
             si = around.bent(si, self.has_shape(k, number))
         if all(obj.upright for obj in self.objects) and not self.any_bent:
@@ -597,6 +623,7 @@ class WalkMedia:
 
         Masks and blends may show another surface where an object is.
         """
+        # what a mask or blend has drawn is another surface than that of the object
         k, bsdf = self.index_of(si), si.bsdf()
         for number, around in enumerate(self.wrappings):
             if around.mixes:
@@ -616,6 +643,7 @@ class WalkMedia:
         """
         if not (np.isfinite(mm_per_unit) and mm_per_unit > 0):
             raise ValueError(f"mm_per_unit must be finite and > 0, got {mm_per_unit!r}")
+        # ---- the geometry of each shape, and whether its medium can be there
         shapes, shown = translucent_shapes(scene), shown_groups(scene)
         instance_table, objects = InstanceTable.of(shapes, shown), [analyse_shape(shape, scene) for shape in shapes]
         inner = instance_table.scene(scene)
@@ -630,6 +658,8 @@ class WalkMedia:
                 raise ValueError(f"the medium of an instance must not vary in space, got that of object {obj.name}")
             if inside.textured is not None:
                 inside.textured.check(obj)
+
+        # ---- what lies inside, and what is around the surfaces
         result = InclusionTable.of(scene, objects)
         check_together(scene, [inner, *([result.scene] if result else []), *(obj.scene for obj in objects)])
         wrappings = [wrapping_of(shape) for shape in shapes]
@@ -638,16 +668,11 @@ class WalkMedia:
         _check_mixes(wrappings, objects, instance_table, result)
         surfaces, some = [around.surface for around in wrappings], any(a.bend or a.mixes for a in wrappings)
         return cls(
-            objects,
-            [surface.spec for surface in surfaces],
-            inner,
-            [surface.boundary for surface in surfaces],
-            float(mm_per_unit),
-            result,
-            tuple(wrappings) if some else (),
-            tuple(shown),
-            InstanceScene.of(scene, shown),
-        )
+            objects=objects, specs=[surface.spec for surface in surfaces], scene=inner,
+            boundaries=[surface.boundary for surface in surfaces], mm_per_unit=float(mm_per_unit), inner=result,
+            wrappings=tuple(wrappings) if some else (), shown=tuple(shown),
+            instance_scene=InstanceScene.of(scene, shown),
+        )  # fmt: skip
 
 
 _OF_OBJECT: WeakKeyDictionary[TranslucentObject, WalkMedia] = WeakKeyDictionary()

@@ -37,7 +37,7 @@ class Flight(NamedTuple):
 
 
 def pick(values: mi.Spectrum, channel: mi.UInt32) -> mi.Float:
-    """The value of one channel."""
+    """The component of a spectrum that belongs to a channel."""
     value = values[0]
     for c in range(1, len(values)):
         value = dr.select(channel == c, values[c], value)
@@ -50,6 +50,7 @@ def weigh(
     """w and q after a step with the value f_c and the density p_c, each up to one factor that they share."""
     if len(weight) == 1:
         return weight * value / pdf, density
+    # q_k p_k over mean_j q_j p_j, and w_c f_c over the same
     grown = density * pdf
     scale = 1 / dr.maximum(channel_mean(grown), 1e-37)
     return weight * value * scale, grown * scale
@@ -87,13 +88,14 @@ def fly(
         m: coefficients at the distance t.
         u: uniform number that decides whether a collision is real; None where M = sigma_t, so that all are.
     """
+    # real with the probability sigma_t,k / M_k of the channel of the walk
     collides = t < reach
     scatters = collides if u is None else collides & (u * pick(m.majorant, channel) < pick(m.sigma_t, channel))
     null = mi.Bool(False) if u is None else collides & ~scatters
     if len(weight) == 1:
         value = dr.select(scatters, m.sigma_s / m.sigma_t, 1)
         return Flight(scatters, null, weight * value, density)
-    # over that of the walk's channel
+    # f_c and p_c, both over exp(-M_k t) of the walk's channel
     through = dr.exp(-(m.majorant - pick(m.majorant, channel)) * dr.minimum(t, reach))
     otherwise = mi.Spectrum(1) if u is None else dr.select(null, dr.maximum(m.majorant - m.sigma_t, 0), 1)
     value = dr.select(scatters, m.sigma_s, otherwise) * through
@@ -116,6 +118,7 @@ def turn(
     same_g: bool,
 ) -> tuple:
     """A new direction by the phase function, and w and q after it."""
+    # theta by the phase function of the walk's channel, phi uniform
     cosine = sample_hg(u.x, pick(m.g, channel))
     sine = dr.safe_sqrt((1 - cosine) * (1 + cosine))
     sin_phi, cos_phi = dr.sincos(2 * dr.pi * u.y)
@@ -123,12 +126,14 @@ def turn(
     new *= 1.5 - 0.5 * dr.squared_norm(new)  # one Newton step: float32 drifts over thousands of turns
     if same_g or len(weight) == 1:
         return new, weight, density
+    # f_c = p_c = phase function of the channel
     phase = eval_phase(m, cosine)
     return new, *weigh(weight, density, phase, phase)
 
 
 def roulette(weight: mi.Spectrum, scale: mi.Float, u: mi.Float) -> tuple[mi.Bool, mi.Spectrum]:
     """Whether a walk goes on, and its weight if it does; `scale` is the square of the relative index passed so far."""
+    # q = size / (limit boost) below the limit: survivors are boosted, as few of them are worth their time
     size = dr.max(weight) * scale
     survive = dr.select(size < ROULETTE_WEIGHT, size / (ROULETTE_WEIGHT * ROULETTE_BOOST), 1)
     return u < survive, dr.select(survive < 1, weight / dr.maximum(survive, 1e-30), weight)
@@ -141,7 +146,7 @@ Record = TypeVar("Record")  # of a visitor, any PyTree of Dr.Jit
 
 @dataclass
 class Walk:
-    """State of a walk."""
+    """A walk in an object or outside, between two of its events."""
 
     alive: mi.Bool  # whether it goes on
     object: mi.Int32  # the object around it, by number, or OUTSIDE
@@ -230,15 +235,20 @@ class Walker:
 
     def step(self, walk: Walk, record: Record) -> tuple[Walk, Record]:
         """A free flight, and the scattering event, the null collision or the boundary at its end."""
+        # ---- free path t = -ln(1 - u) / M_k, and the boundary on its way
         media, rng = self.media, walk.rng
         m, u = media.coefficients(walk.object, walk.o, walk.medium), None
         t = free_path(m, walk.channel, rng.next_float32())
         ray, p = walk.ray(t), mi.Point3f(walk.o + walk.d * t)
         hit = (media.inner or media).scene.ray_intersect_preliminary(ray, coherent=False)
+
+        # ---- w_c = f_c / mean_k p_k of the flight, by the coefficients at its end
         if media.varies:
             m, u = media.coefficients(walk.object, p, walk.medium), rng.next_float32()
         flight = fly(m, walk.weight, walk.density, walk.channel, t, walk.reach(hit.t), u)
         walk = replace(walk, weight=flight.weight, density=flight.density)
+
+        # ---- a null collision goes on from p along the same direction; what rounding has put outside ends
         event = Event(p, ray.d, walk.object, m, walk.medium)
         meets = ~(flight.scatters | flight.null)
         if media.varies:
@@ -246,15 +256,20 @@ class Walker:
             off = dr.select(flight.null, media.behind(walk.object, walk.d), walk.off)
             walk = replace(walk, o=o, off=off, alive=walk.alive & (~flight.null | media.box.contains(o)))
             walk.object = dr.select(walk.alive, walk.object, OUTSIDE)
+
+        # ---- a real collision scatters, the boundary reflects or lets out
         walk, record = dr.if_stmt((walk, record, event), flight.scatters, self._scatter, _pass, label="scatter")
         meet = self._meet if media.inner is None else self._meet_inside
         return dr.if_stmt((walk, record, ray, hit), meets, meet, _pass, label="boundary")
 
     def _scatter(self, walk: Walk, record: Record, event: Event) -> tuple[Walk, Record]:
+        # ---- light at the event, then a direction by the phase function
         walk, record = self.visitor.event(walk, record, event)
         rng, media = walk.rng, self.media
         u = mi.Point2f(rng.next_float32(), rng.next_float32())
         d, weight, density = turn(event.m, walk.weight, walk.density, walk.channel, event.along, u, media.same_g)
+
+        # ---- roulette, by the largest weight as it would be outside
         order = walk.order + 1
         scale = walk.scale
         if self.roulette_from > 1:  # before, walks without weight alone end
@@ -269,16 +284,21 @@ class Walker:
         self, walk: Walk, record: Record, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f
     ) -> tuple[Walk, Record]:
         """Reflection at the boundary seen from inside, or the way out."""
+        # ---- the boundary that is met, with its normals outwards
         media, k = self.media, walk.object
         si = media.instance_scene.interaction(hit, ray, media.needed)
         met = media.met(si, k)
         si = media.seen(si, k, ray.d)
         # the flight goes on behind an object that overlaps, and behind the own boundary if rounding has put it outside
         passes = (met != k) | (dr.dot(si.n, ray.d) < 0)
+
+        # ---- light through a rough boundary, then reflection with the probability F, else refraction
         counts = media.counts(k, walk.order)
         walk, record = self.visitor.boundary(walk, record, si, ~passes & counts)
         bs, value = sample_bsdf(media.boundary(k), si, walk.rng)
         d, turned = sided(si, bs.wo)
+
+        # ---- the way on: outside only with an order that counts; weight *= value, scale *= eta²
         out = ~passes & (dr.dot(d, si.n) > 0)
         alive = (passes | (bs.pdf > 0)) & (~out | counts)
         d = dr.select(passes, ray.d, d)
@@ -295,6 +315,7 @@ class Walker:
         self, walk: Walk, record: Record, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f
     ) -> tuple[Walk, Record]:
         """The same where something lies inside: reflection or refraction at any surface, into what is on that side."""
+        # ---- what is met: the own boundary, that of an object within, or another surface
         media, inner, k = self.media, self.media.inner, walk.object
         si = media.instance_scene.interaction(hit, ray, mi.RayFlags.All)
         met, around = media.index_of(si, si.is_valid()), inner.around(si)
@@ -302,16 +323,19 @@ class Walker:
         si = media.seen(si, met, ray.d)
         refracts = plain & inner.displaces(si)
         inwards = dr.dot(si.n, ray.d) < 0
+
         # the flight goes on behind what it can meet only if rounding has put it there
         passes = (own & inwards) | ((nested | refracts) & (~inwards | (around != k)))
-        boundary = media.boundary(dr.maximum(met, 0))
-        boundary = boundary if isinstance(boundary, mi.BSDFPtr) else mi.BSDFPtr(boundary)
-        bsdf = dr.select(plain, si.bsdf(), boundary)
+
+        # ---- light that the surface emits or sends on, then a direction by its BSDF
+        bsdf = dr.select(plain, si.bsdf(), media.boundary_pointer(dr.maximum(met, 0)))
         walk, record = self.visitor.surface(walk, record, si, bsdf, met)
         walk, record = self.visitor.boundary(walk, record, si, own & ~passes & (around < 0))
         bs, value = sample_bsdf(bsdf, si, walk.rng)
         d, turned = sided(si, bs.wo)
         d = dr.select(plain, si.to_world(bs.wo), d)
+
+        # ---- through: into what is around the own boundary, into the object met, or into glass, which is outside
         through = (mi.Frame3f.cos_theta(bs.wo) * mi.Frame3f.cos_theta(si.wi) < 0) & ~mi.has_flag(
             bs.sampled_type, mi.BSDFFlags.Null
         )
@@ -319,6 +343,8 @@ class Walker:
         through &= ~passes
         to, d, value = dr.select(through, to, k), dr.select(passes, ray.d, d), dr.select(passes, 1, value)
         alive = si.is_valid() & (passes | ((bs.pdf > 0) & (dr.max(value) > 0)))
+
+        # ---- the way on, with the medium of what it enters; such paths count as a transport's from now on
         o, off = media.depart(si, d, to >= 0)
         if media.carried:
             new = (to != k) & (to >= 0)
@@ -439,6 +465,7 @@ class ExitVisitor:
         return walk, record
 
     def crossing(self, walk: Walk, record: mi.UInt32, crossing: Crossing) -> tuple[Walk, mi.UInt32]:
+        # x_i and w_i of a walk that leaves, with its throughput; the walk ends
         leaves, si = walk.alive & crossing.leaves, crossing.si
         at = surface_point(si.p, si.n, si.sh_frame.n, walk.d)
         kept = leaves & (walk.order >= self.fewest) & (walk.order <= self.most)
@@ -538,6 +565,7 @@ def _enter(
     media: WalkMedia, k: mi.UInt32, start: SurfacePoint, total: mi.UInt32, index: mi.UInt32, rng: mi.PCG32
 ) -> Walk:
     """The walk of one of so many starts, refracted into the object."""
+    # ---- the point of the boundary, as the direction w outside sees it
     known = index < total
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(index))
     si.p = dr.gather(mi.Point3f, start.p, index, known)
@@ -546,6 +574,8 @@ def _enter(
     w = dr.gather(mi.Vector3f, start.w, index, known)
     si.wi = si.to_local(w)
     si = lift(si, w)
+
+    # ---- refraction into the object, with the weight 1 - F
     ctx = mi.BSDFContext()
     ctx.type_mask = mi.BSDFFlags.Transmission
     bs, value = sample_bsdf(media.boundary(k), si, rng, ctx)
@@ -555,6 +585,8 @@ def _enter(
         of_exit = dr.gather(MediumAt, start.medium, index, known)
         lanes = dr.width(index)
         medium = replace(media.unknown(lanes), sigma_t=of_exit.sigma_t, sigma_s=of_exit.albedo * of_exit.sigma_t)
+
+    # ---- the walk, whose channel is drawn once
     walk = start_walk(si.p, d, rng, medium)
     enters = known & (dr.dot(w, si.n) > 0) & (dr.dot(d, si.n) < 0) & (dr.max(value) > 0)
     enters &= mi.Frame3f.cos_theta(si.wi) > 0

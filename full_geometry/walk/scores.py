@@ -66,7 +66,7 @@ def phase_score(g: mi.Spectrum, cosine: mi.Float) -> mi.Spectrum:
 
 @dataclass
 class Stay:
-    """Of a path inside one object, from its entry on."""
+    """A stay of a path inside one object, from its entry on."""
 
     object: mi.Int32  # by number; -1 outside
     score: Score
@@ -77,14 +77,15 @@ class Stay:
 
     @classmethod
     def none(cls, lanes: int, textured: bool, before: mi.UInt32 | None = None) -> Stay:
-        """Of a path outside; of one that begins without the number of stays `before`."""
+        """No stay, as of a path outside; `before` is the number of those that have ended, 0 where it begins."""
         along, turned = dr.zeros(mi.Vector3f, lanes), dr.full(mi.Bool, False, lanes)
         before = dr.zeros(mi.UInt32, lanes) if before is None else before
         place = Place.unknown(lanes) if textured else ()
         return cls(dr.full(mi.Int32, -1, lanes), Score.zeros(lanes), along, turned, before, place)
 
     def flown(self, walk: Walk, p: mi.Point3f, media: WalkMedia) -> Stay:
-        """After a flight to p: its length, and the angle by which it began."""
+        """The stay after a flight to p, whose length and first angle count."""
+        # d log p / dg of the angle that the flight began by, and its length d
         g = media.spectrum("g", walk.object)
         turn = dr.select(self.turned, phase_score(g, dr.dot(self.along, walk.d)), 0)
         score = self.score + Score(mi.Float(0), dr.norm(p - walk.o), turn)
@@ -92,7 +93,7 @@ class Stay:
         return replace(self, object=walk.object, score=score, turned=mi.Bool(False), place=place)
 
     def scattered(self, event: Event) -> Stay:
-        """After a scattering event."""
+        """The stay after a scattering event."""
         score = replace(self.score, n=self.score.n + 1)
         return replace(self, score=score, along=event.along, turned=mi.Bool(True))
 
@@ -129,7 +130,7 @@ class KeptStays:
 
     @classmethod
     def of(cls, paths: int) -> KeptStays:
-        """For so many paths."""
+        """Empty slots for so many paths."""
         room = SLOTS * paths
         number, left = dr.full(mi.Int32, -1, room), dr.full(mi.UInt32, 1, paths)
         result = cls(paths, number, Place.unknown(room), left, Score.sums(room), Score.zeros(room))
@@ -138,9 +139,12 @@ class KeptStays:
 
     def add(self, index: mi.UInt32, stay: Stay, p: Score, active: mi.Bool) -> None:
         """A stay of each path that has ended."""
+        # stay i >= SLOTS - 1 replaces the last slot with the probability 1 / (i - SLOTS + 2): reservoir sampling
         left = mi.UInt32(dr.maximum(mi.Int32(stay.before) - (SLOTS - 2), 1))
         drawn = mi.sample_tea_32(index, stay.before)[0] % left == 0
         at = index + dr.minimum(stay.before, SLOTS - 1) * dr.opaque(mi.UInt32, self.paths)
+
+        # where the stay began, p and q at its end
         pairs = [(self.number, stay.object)]
         for to, value in ((self.place, stay.place), (self.p, p), (self.q, stay.score)):
             pairs += [(getattr(to, each.name), getattr(value, each.name)) for each in fields(to)]
@@ -187,7 +191,7 @@ class PathScores:
 
     @classmethod
     def of(cls, media: WalkMedia, paths: int) -> PathScores:
-        """For so many paths."""
+        """Sums of 0 for so many paths."""
         numbers = [k for k, _ in followed(media)]
         rows = mi.Int32([numbers.index(k) if k in numbers else -1 for k in media.instance_table.kind])
         room, textured = paths * len(numbers), followed_textures(media)
@@ -199,6 +203,7 @@ class PathScores:
 
     def add(self, r: StayRecord) -> None:
         """The stays of paths, which have ended."""
+        # p += slopes of the light inside - q L, q += score at the end: slopes of the whole path are p + q L
         row, end = dr.gather(mi.Int32, self.rows, r.stay.object), r.stay.score
         at, known = r.index + mi.UInt32(dr.maximum(row, 0)) * dr.opaque(mi.UInt32, self.paths), row >= 0
         p = r.record.slopes + end * (-r.record.L)
@@ -209,7 +214,7 @@ class PathScores:
             self.kept.add(r.index, r.stay, p, dr.gather(mi.Bool, self.painted, r.stay.object))
 
     def slopes(self, row: int, L: mi.Spectrum) -> Score:
-        """Of the light L of all paths."""
+        """The slopes p + q L of the light L of all paths, in one object."""
         at = dr.arange(mi.UInt32, self.paths) + row * self.paths
         return _gathered(self.p, at) + _gathered(self.q, at) * L
 
@@ -230,6 +235,7 @@ class ScoreVisitor:
 
     def _gathered(self, r: StayRecord, stay: Stay, before: mi.Spectrum, after: Any) -> StayRecord:
         """The record after a visit that has added to the light."""
+        # slopes += score (L after - L before)
         slopes = after.slopes + stay.score * (after.L - before)
         return replace(r, record=replace(after, slopes=slopes), stay=stay)
 
@@ -375,11 +381,14 @@ def followed_textures(media: WalkMedia) -> dict[int, TexturedMedium]:
 
 def with_derivatives(L: mi.Spectrum, scores: PathScores, media: WalkMedia) -> mi.Spectrum:
     """The light L of paths, with derivatives by the media of objects whose gradients are enabled."""
+    # objects of one medium: Σ over paths of dL / dcoefficient
     result = mi.Spectrum(L)
     for row, (_, values) in enumerate(followed(media)):
         with dr.suspend_grad():
             slopes = scores.slopes(row, L)
         result += _change(slopes, values)
+
+    # objects with textures: by the coefficients where each stay began
     textured = followed_textures(media) if scores.kept else {}
     with dr.suspend_grad():
         slots = list(scores.kept.slots(L)) if textured else []
@@ -394,6 +403,7 @@ def with_derivatives(L: mi.Spectrum, scores: PathScores, media: WalkMedia) -> mi
 
 def _change(slopes: Score, values: dict[str, mi.Spectrum]) -> mi.Spectrum:
     """Zero, with the derivatives that the slopes are by coefficients."""
+    # d log f = n dalbedo / albedo + (n / sigma_t - d) dsigma_t + Σ d log p / dg dg, as sigma_s = albedo sigma_t
     result = mi.Spectrum(0)
     for name, value in values.items():
         known = dr.detach(value)

@@ -81,16 +81,21 @@ class StraightLight:
 
     def light(self, event: Event, rng: mi.PCG32) -> tuple[mi.Spectrum, Score | tuple[()]]:
         """An estimate of the light that an event sends on, per weight of the walk, and its slopes."""
+        # ---- one of n emitters, and a direction to it: density p_e = pdf / n
         at, n, emitter = interaction_of(event.p, event.medium), len(self.emitters), self.emitters[0]
         if n > 1:
             pointer = dr.gather(mi.UInt32, self.tables["pointer"], draw(n, rng))
             emitter = dr.reinterpret_array(mi.EmitterPtr, pointer)
         ds, light = emitter.sample_direction(at, mi.Point2f(rng.next_float32(), rng.next_float32()))
+
+        # ---- p(cos) L_e / p_e  p_e / (p_e + p_phase)
         cosine = dr.dot(event.along, ds.d)
         phase = eval_phase(event.m, cosine)
         weight = dr.select(ds.delta, 1, mis_weight(ds.pdf / n, channel_mean(phase)))
         value = dr.select(ds.pdf > 0, phase * light * (n * weight), 0)
         lit = (dr.max(value) > 0) & dr.isfinite(channel_mean(value))
+
+        # ---- exp(-∫ sigma_t) on the way, 0 where something else is on it
         way = self._way(event, ds, lit, rng)
         result = dr.select(lit & way.arrives, value * way.T, 0)
         if not self.scored:
@@ -103,6 +108,7 @@ class StraightLight:
         reach = FARTHEST / dr.min(event.m.mean_t)
 
         def go(way: LightWay) -> LightWay:
+            # to the own boundary or to what is before the emitter; the first way out no further than `reach`
             ray = mi.Ray3f(way.ray)
             first = way.inside & (way.length == 0)
             ray.maxt = dr.select(first, dr.minimum(reach, way.left), way.left)
@@ -111,6 +117,8 @@ class StraightLight:
             own = hit & (media.index_of(si, hit) == k)
             leaves = dr.dot(si.n, ray.d) * media.side(k, si.prim_index) > 0
             passed = own & way.inside & leaves
+
+            # T *= exp(-sigma_t t) of a segment inside; on through the boundary along the same direction
             T = media.transmittance(k, ray, dr.select(passed, si.t, 0), way.rng, medium)
             o = mi.Point3f(ray.o + ray.d * si.t + media.clear(k, si.n, ray.d))
             going = way.going & (passed | (own & ~way.inside & ~leaves & again))
@@ -120,6 +128,7 @@ class StraightLight:
                 length=way.length + dr.select(passed, si.t, 0), T=dr.select(passed, way.T * T, way.T), rng=way.rng,
             )  # fmt: skip
 
+        # the ray ends before the surface of the emitter, as far as rounding may put it
         left = ds.dist - before(ds.p, ds.dist, media.instance_scene.rounding_of(ds.emitter))
         start = LightWay(
             ray=ray_of(event.p, ds.d, medium), left=left, inside=mi.Bool(True) | active, going=mi.Bool(active),

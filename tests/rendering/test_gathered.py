@@ -14,7 +14,7 @@ from full_geometry.learning.meshes import Box, surface
 from full_geometry.learning.shapes import box
 from full_geometry.precomputed.entries import StratifiedEntries
 from full_geometry.precomputed.point_pairs import Rays, lit_pairs
-from full_geometry.precomputed.transfer import Incident, RowUniforms
+from full_geometry.precomputed.transport_matrix import Incident, RowUniforms
 from full_geometry.sampling.light_points import SurfacePoints, uniform_entries
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -206,7 +206,7 @@ def test_a_mirrored_lamp_that_few_directions_found_is_shared_by_all_points() -> 
 
 def test_rings_keep_uniform_light_as_it_is() -> None:
     scene = _scene("gathered", lights=_lights("sky"))
-    T = scene.integrator().prepare(scene)[0].gathered.transfer
+    T = scene.integrator().prepare(scene)[0].gathered.matrix
     shape = (len(T.points), T.t.shape[2])
     B = T @ Incident(np.full(shape, 2.0, np.float32), np.zeros((*shape, 3), np.float32))
     assert np.allclose(B[:, :, 0], 2 * T.t.sum(axis=1), rtol=1e-4)
@@ -263,7 +263,7 @@ def test_s_leans_towards_the_other_end_by_a_network_and_not_by_a_dipole() -> Non
     leanings = {}
     for model in ("better_dipole", "neural"):
         scene = _scene("gathered", lights=_lights("sky"), model=model)
-        leanings[model] = scene.integrator().prepare(scene)[0].gathered.transfer.g[:6]
+        leanings[model] = scene.integrator().prepare(scene)[0].gathered.matrix.g[:6]
     assert np.abs(leanings["better_dipole"]).max() < 0.15
     assert (leanings["neural"][1:, :, 1] < -0.25).all()
 

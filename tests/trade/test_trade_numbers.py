@@ -100,7 +100,7 @@ def test_the_kept_noise_of_gathered_parts_is_half_that_of_light_and_a_part_of_th
         for part in parts:
             transfer = T * rng.normal(1, of_transfer, T.shape) if of_transfer else T
             light = L * rng.normal(1, of_light, L.shape) if of_light else L
-            gathered = Gathered(*[None] * 5, transfer=transfer, light=light)
+            gathered = Gathered(*[None] * 5, matrix=transfer, light=light)
             part._found = [SimpleNamespace(gathered=gathered)]
         return parts[0].kept(parts[1], 0)
 

@@ -1,4 +1,4 @@
-"""What light that is gathered at points of an object is worth where it leaves: the rows of a transfer matrix.
+"""What light that is gathered at points of an object is worth where it leaves: the rows of the transport matrix.
 
 Directions are taken apart: with the directional albedo a(mu) of the model,
 
@@ -70,7 +70,7 @@ RINGS = 2.0, 5.0  # distances of entries that part the rings, over that of point
 STEPS = tuple(2 ** (k / 2) for k in range(12))  # and those that part the steps of g
 KNOWN_ROUNDS = 16  # smoothings of what S brings over alpha,
 SLOPE_ROUNDS = 2  # of the slope over w_o,
-BEYOND_ROUNDS = 16  # and of what S along directions of light has beyond the transfer
+BEYOND_ROUNDS = 16  # and of what S along directions of light has beyond the matrix
 LIKE_DISTANCES, LIKE_COSINES = 14, 8  # classes of pairs of points
 ROUNDS = 0, 2, 8  # and how often what each brings is smoothed,
 SHARE_ROUNDS = 2, 4, 8  # and its share of the row
@@ -123,7 +123,7 @@ class Incident:
     """Radiance at points, weighted by a(mu_i) mu_i.
 
     Args:
-        mean: (points, channels), less what is known without a transfer.
+        mean: (points, channels), less what is known without the matrix.
         moment: mean of L_i(w) (bent w - middle), `middle` that of `Hemispheres`, (points, channels, 3).
     """
 
@@ -159,16 +159,21 @@ class Hemispheres(NamedTuple):
     @classmethod
     def of(cls, points: SurfacePoints, albedo: Albedo) -> Hemispheres:
         """By a lattice of directions: of the few that light is gathered along they would be too noisy."""
+        # directions w of a lattice by the cosine, of density mu / pi, so that a mu / density = pi a
         k, each = dr.arange(mi.UInt32, len(points) * LATTICE), dr.opaque(mi.UInt32, LATTICE)
         j, s = k // each, mi.Float(k % each)
         n, n_out = (dr.gather(mi.Normal3f, v, j) for v in (points.n, points.n_out))
         w, _ = cosine_above(n_out, n, mi.Point2f((s + 0.5) / LATTICE, wrapped(s * GOLDEN)))
         a = albedo(cosine(w, n, n_out)) * dr.pi
+
+        # sums over directions of a, of a w and of a w w^T, w bent by the boundary
         weight, w = dr.mean(a), bent(w, n_out, albedo.eta)
         values = [*a, *(weight * w), *(weight * w[i] * w[k] for i in range(3) for k in range(3)), weight]
         dr.eval(values)  # once for all sums
         sums = [dr.block_sum(v, LATTICE) for v in values]
         *rows, total = (np.array(v, dtype=float) for v in sums)
+
+        # ∫ a mu dw, the mean E[w], and the covariance E[w w^T] - E[w] E[w]^T
         whole, middle, second = np.split(np.stack(rows, axis=1), [len(rows) - 12, len(rows) - 9], axis=1)
         middle, second = (v / np.maximum(total, 1e-30)[:, None] for v in (middle, second))
         C = second.reshape(-1, 3, 3) - middle[:, :, None] * middle[:, None, :]
@@ -176,8 +181,8 @@ class Hemispheres(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Transfer:
-    """Of one object.
+class TransportMatrix:
+    """The transport matrix t_js of one object, B_j = Σ_s t_js L_k(j,s), and what its light needs beyond that.
 
     Args:
         points: where light is gathered and where it leaves.
@@ -223,6 +228,7 @@ class Transfer:
     def __matmul__(self, L: Incident) -> np.ndarray:
         """B for incident radiance, linear in the bent w_o: constant and slope, (points, channels, 4)."""
         light = self._arriving(L)
+        # B in the mean over w_o by rings, and its slope over w_o by Σ_s t_s L_s g_s
         brought = self.t * light
         slope = self._slope(brought.sum(axis=1), self._leaning(brought), SLOPE_ROUNDS)
         return self._about_middle(self._by_place(light), slope)
@@ -234,16 +240,21 @@ class Transfer:
             L: mean of the radiance that comes along rays, (points, channels).
             rays: to points.
         """
+        # ---- S of a few pairs, along a direction w of light at the entry, over a(mu_i)
         lit = lit_pairs((self.t * np.take(L, self.entry, axis=0)).mean(axis=2), self.entry, rays)
         (S, mu), rows, point = self.pairs.S(lit), len(self.points), self.entry.ravel()[lit.number]
         toward, step, t, unit = (
             v.reshape(-1, *v.shape[2:])[lit.number] for v in (self.toward, self.step, self.t, self.unit)
         )
         found = unit * S / np.maximum(np.array(self.albedo(mi.Float(mu))).T, self.albedo.least)
+
+        # ---- t' - t (1 + g.w), times the light along w
         n, g, row = self._n_out[point], self.g[step], lit.row
         d = _bent(lit.w, n, self.albedo.eta) - self.around.middle[point]
         expected = 1 + g[:, :, 0] * (d * n).sum(axis=1)[:, None] + g[:, :, 1] * (d * toward).sum(axis=1)[:, None]
         more = (found - t * np.maximum(expected, 0)) * lit.colour * L[point] * lit.share[:, None]
+
+        # ---- Σ over pairs of a row, and the slope over w_o likewise; averaged over the neighbourhood
         brought, upright = (row_sums(row, v, rows) for v in (more, more * g[:, :, 0]))
         aside = [row_sums(row, more * g[:, :, 1] * toward[:, k, None], rows) for k in range(3)]
         slope = self._slope(
@@ -254,24 +265,24 @@ class Transfer:
         return self._about_middle(brought, slope)
 
     def _leaning(self, brought: np.ndarray) -> np.ndarray:
-        """The slope over w_o of what entries bring, (points, channels, 3)."""
+        """The slope over w_o of what entries bring, Σ_s t_s L_s (g_n n - g_d d), (points, channels, 3)."""
         upright, aside = (brought * np.take(self.g[:, :, k], self.step, axis=0) for k in range(2))
         return upright.sum(axis=1)[:, :, None] * self._n_out[:, None] - aside.transpose(0, 2, 1) @ self.toward
 
     @cached_property
     def _even(self) -> np.ndarray:
-        """That of uniform light, over what it brings."""
+        """The slope of uniform light over what it brings, (points, channels, 3)."""
         return self._leaning(self.t) / np.maximum(self.t.sum(axis=1), 1e-30)[:, :, None]
 
     def _slope(self, brought: np.ndarray, leaning: np.ndarray, rounds: int) -> np.ndarray:
-        """Less that of uniform light, where a(w_o) is all; smoothed."""
+        """The slope less that of uniform light, which has a(w_o) alone; smoothed, (points, channels, 3)."""
         slope = leaning - brought[:, :, None] * self._even
         for _ in range(rounds):
             slope = self.points.smoothed(slope)
         return slope
 
     def _about_middle(self, mean: np.ndarray, slope: np.ndarray) -> np.ndarray:
-        """Constant and slope of what has that mean over w_o."""
+        """Constant and slope of what has that mean over w_o: constant = mean - slope.middle."""
         constant = mean - np.einsum("jck,jk->jc", slope, self.around.middle)
         return np.concatenate([constant[:, :, None], slope], axis=2)
 
@@ -281,12 +292,17 @@ class Transfer:
 
     def _arriving(self, L: Incident) -> np.ndarray:
         """The mean of L_i (1 + g.(bent w_i - middle)) of entries, (points, samples, channels)."""
+        # g_n n.M of the entry's point
         upright = np.einsum("jck,jk->jc", L.moment, self._n_out)
         light = np.take(self.g[:, :, 0], self.step, axis=0) * np.take(upright, self.entry, axis=0)
+
+        # g_d d.M, d towards the exit
         aside = np.zeros_like(light)
         for axis in range(3):
             aside += np.take(L.moment[:, :, axis], self.entry, axis=0) * self.toward[:, :, axis, None]
         light += np.take(self.g[:, :, 1], self.step, axis=0) * aside
+
+        # and L itself
         light += np.take(L.mean, self.entry, axis=0)
         return light
 
@@ -296,6 +312,7 @@ class Transfer:
         The light of a ring is the mean over its entries in the neighbourhood, the wider the farther they are; so is the
         share of the ring.
         """
+        # Σ over rings of share smooth(Σ t L) / smooth(Σ t)
         share, whole = self._shares
         return (share * self._smoothed(self._by_ring(light), ROUNDS) / np.maximum(whole, 1e-30)).sum(axis=1)
 
@@ -310,6 +327,7 @@ class Transfer:
     def _shares(self) -> tuple[np.ndarray, np.ndarray]:
         """Of uniform light, (points, rings, channels): shares of the row, and what rings bring, both smoothed."""
         found = self._by_ring(np.ones_like(self.t))
+        # the shares of a row keep its sum
         share = self._smoothed(found, SHARE_ROUNDS)
         share *= (found.sum(axis=1) / np.maximum(share.sum(axis=1), 1e-30))[:, None]
         return share, self._smoothed(found, ROUNDS)
@@ -329,26 +347,35 @@ def count_of(obj: TranslucentObject) -> int:
     return int(np.clip(obj.geometry.area * (PER_LENGTH * sigma) ** 2, FEWEST, MOST))
 
 
-def transfer(obj: TranslucentObject, share: float = 1.0, seed: int = SEED) -> Transfer:
-    """The transfer of an object, by its model and the radial density of its proposals, with a share of all entries."""
+def transport_matrix(obj: TranslucentObject, share: float = 1.0, seed: int = SEED) -> TransportMatrix:
+    """The transport matrix of an object by its model, with a share of all entries, which its proposals draw."""
+    # ---- entries of each point with S mu_i over their density: by distance, or by the proposals of dense objects
     points = SurfacePoints.of(obj.geometry, count_of(obj))
     n = max(int(share * max(SAMPLES / len(points), FEWEST_ENTRIES)), FEWEST_OF_PART)
     if places_resolve(obj):
         result = stratified(obj, points, n, seed)
     else:
         result = drawn(obj, points, int(DENSE * n) * len(points), seed)
+
+    # ---- S without the reflectance R^e of the exit, and the sums of rows that uniform light has
     paint = None if obj.textured is None else result.paint
     e = np.zeros(result.S.shape[2], np.float32) if paint is None else _exponents(points, result)
     S = result.S / (result.paint**e)[:, None]
     trusted, whole = _rows(obj, points, result, S, paint)
+
+    # ---- the point k(j, s) of each entry, and its distance, in rings and in steps of g
     near = np.where(result.known, result.near, np.arange(len(points), dtype=np.uint32)[:, None])
     toward, d, kind = _geometry(points, near)
     # rows beside an edge of a texture are not to be averaged with those beyond
     ring = np.digitize(d, RINGS).astype(np.uint8) if paint is None else np.zeros(d.shape, np.uint8)
     step = np.digitize(d, STEPS).astype(np.uint8)
+
+    # ---- g by least squares, from what S has beyond a separable one
     around = Hemispheres.of(points, result.albedo)
     t = _scaled(S, whole)
     g, factors = _leanings(points, around, result, (near, t, t - _expected(result, t, kind)), (toward, step))
+
+    # ---- t = S / (a(w_o) a(w_i) (1 + g.w_o) (1 + g.w_i)), which keeps what pairs in a like position bring
     weight = np.take(around.whole.astype(np.float32), near, axis=0)
     weight /= np.maximum(result.a, result.albedo.least) * factors[1]
     over = weight / (np.maximum(result.cosine, LEAST) * factors[0])
@@ -357,17 +384,24 @@ def transfer(obj: TranslucentObject, share: float = 1.0, seed: int = SEED) -> Tr
     over *= kept
     S *= over
     t = _scaled(S, whole)
+
+    # ---- standard error of a row by the spread of its terms, σ / (mean sqrt(n))
     sums, n = S.sum(axis=1, keepdims=True), S.shape[1]
     deviation = (S - sums / n).std(axis=1) / np.sqrt(n) / np.maximum(sums[:, 0].mean(axis=0) / n, 1e-30)
     error = float(np.sqrt((deviation**2).mean(axis=0)).max())
+
+    # ---- t per S / a(mu_i), for pairs of which S is asked again
     scale = whole / np.maximum(sums[:, 0], 1e-30) / result.paint**e
     unit = weight * kept * (result.albedo.whole * scale).astype(np.float32)[:, None]
     pairs = EntryPairs(obj, points.exit_along, result.w_o, result.entries)
-    return Transfer(points, around, near, t, ring, toward, step, g, result.albedo, error, e, trusted, pairs, unit)
+    return TransportMatrix(
+        points=points, around=around, entry=near, t=t, ring=ring, toward=toward, step=step, g=g, albedo=result.albedo,
+        error=error, e=e, trusted=trusted, pairs=pairs, unit=unit,
+    )  # fmt: skip
 
 
 def _scaled(S: np.ndarray, whole: np.ndarray) -> np.ndarray:
-    """Rows of these sums."""
+    """S scaled to rows of these sums."""
     return (S * (whole / np.maximum(S.sum(axis=1), 1e-30))[:, None]).astype(np.float32)
 
 
@@ -386,6 +420,7 @@ def _leanings(
     where t less what is expected of separable S stands on the right.
     """
     (near, t, beyond), (toward, step), size = weights, apart, len(STEPS) + 1
+    # ---- sums over pairs of A = t E[f f^T] and b = (t - expected) f, of entries and of exits alike
     n_out = np.array(points.n_out, dtype=np.float32).T
     own = np.broadcast_to(np.arange(len(n_out))[:, None], step.shape)
     A, b, cosines = np.zeros((size, t.shape[2], 2, 2)), np.zeros((size, t.shape[2], 2)), []
@@ -399,6 +434,8 @@ def _leanings(
             b[:, :, i] += _summed(step, beyond * cosines[-1][i][:, :, None], size)
             for k in range(2):
                 A[:, :, i, k] += _summed(step, t * np.einsum("jsk,jsk->js", axes[i], spread[k])[:, :, None], size)
+
+    # ---- (A + ridge) g = b, and the factors 1 + g.f of both ends
     A += (1e-3 * np.trace(A, axis1=2, axis2=3) + 1e-30)[:, :, None, None] * np.eye(2)
     g = np.linalg.solve(A, b[..., None])[..., 0].astype(np.float32)
     each = [np.take(g[:, :, k], step, axis=0) for k in range(2)]
@@ -429,10 +466,13 @@ def _geometry(points: SurfacePoints, near: np.ndarray) -> tuple[np.ndarray, np.n
 
     That is by the distance, and the cosines of both normals to the line between the points.
     """
+    # ---- the line from the exit to the entry's point, and its length in distances of points
     p, n = (np.array(v, dtype=np.float32).T for v in (points.p, points.n))
     line = np.take(p, near, axis=0) - p[:, None]
     d = np.sqrt(np.einsum("jsk,jsk->js", line, line)) * (REACH / points.h)
     scale = (REACH / points.h) / np.maximum(d, 1e-6)
+
+    # ---- the class of a pair: by log2(1 + d) and the cosines of both normals to the line
     cosines = np.einsum("jsk,jsk->js", np.take(n, near, axis=0), line), np.einsum("jk,jsk->js", n, line)
     kind = np.minimum(2 * np.log2(1 + d), LIKE_DISTANCES - 1).astype(np.int32)
     for mu in cosines:
@@ -443,6 +483,7 @@ def _geometry(points: SurfacePoints, near: np.ndarray) -> tuple[np.ndarray, np.n
 
 def _expected(found: DrawnEntries, t: np.ndarray, kind: np.ndarray) -> np.ndarray:
     """t if S were separable, and its dependence on positions the same for all pairs that are alike."""
+    # a(w_i) a(w_o) over the density, times the mean of t over that in each class, scaled to the sums of rows
     expected = found.cosine * found.a
     count = LIKE_DISTANCES * LIKE_COSINES**2
     for c in range(t.shape[2]):
@@ -454,6 +495,7 @@ def _expected(found: DrawnEntries, t: np.ndarray, kind: np.ndarray) -> np.ndarra
 
 def _exponents(points: SurfacePoints, found: DrawnEntries) -> np.ndarray:
     """e of each channel, by what reflectance and light of points are over those of their neighbours."""
+    # slope of ln(light) over ln R, both less the mean of their neighbours
     light = found.S.sum(axis=1) / np.maximum(found.a.sum(axis=1), 1e-30)
     x, y = (v - points.smoothed(v) for v in (np.log(found.paint), np.log(np.maximum(light, 1e-30))))
     return np.clip((x * y).sum(axis=0) / np.maximum((x * x).sum(axis=0), 1e-12), 0, 1).astype(np.float32)
@@ -528,7 +570,7 @@ class DrawnEntries(NamedTuple):
 
 
 class _Brought(NamedTuple):
-    """By entries: S mu_i over their density, the direction of incidence, its cosine, and that over its density."""
+    """S mu_i of entries over their density, the direction of incidence, its cosine, and that over its density."""
 
     S: mi.Spectrum
     w_i: mi.Vector3f
@@ -549,10 +591,13 @@ def drawn(obj: TranslucentObject, points: SurfacePoints, samples: int, seed: int
     each = dr.opaque(mi.UInt32, n)  # kernels are those of other numbers of points too
     j, active = k // each, mi.Bool(True)
     sampler = RowUniforms(j, k % each, len(points), n, seed)
+    # ---- an exit at each point in a direction by the cosine, and an entry by the proposals
     out, face = points.exit(j, sampler.next_2d())
     out = obj.knowing(out, face)
     prepared = obj.transport.prepare(out, active)
     entry = obj.proposals.sample(out, face, obj.proposals.prepare(out, prepared, active), sampler, active)
+
+    # ---- S mu_i over the densities, and the point that the entry is nearest to
     brought = _brought(obj, prepared, out, entry, sampler.next_2d())
     near, known = points.nearest(entry.p, entry.n, entry.weight > 0)
     paint = _paint(obj, out)
@@ -563,6 +608,7 @@ def drawn(obj: TranslucentObject, points: SurfacePoints, samples: int, seed: int
 
 def stratified(obj: TranslucentObject, points: SurfacePoints, n: int, seed: int) -> DrawnEntries:
     """About n entries for each point, by their distance from it; those of one exit share what S asks of that."""
+    # ---- `EXITS` exits of each point, with all that S asks of an exit
     n //= EXITS
     each, exits, size = dr.opaque(mi.UInt32, n), dr.opaque(mi.UInt32, EXITS), dr.size_v(mi.Spectrum)
     rows, n = len(points), EXITS * n
@@ -571,12 +617,15 @@ def stratified(obj: TranslucentObject, points: SurfacePoints, n: int, seed: int)
     out, face = points.exit(j, RowUniforms(j, k, rows, EXITS, seed).next_2d())
     out = obj.knowing(out, face)
     prepared, paint = obj.transport.prepare(out, mi.Bool(True)), _paint(obj, out)
+
+    # ---- entries in proportion to the radial density of the model
     entries = StratifiedEntries.of(obj.proposals.positions, points, n, seed)
     u = RowUniforms(j, k, rows, n, seed + 1).pair()
     S, w_i, mu_i, over = (dr.zeros(mi.Float, c * rows * n) for c in (size, 3, 1, 1))
     evaluate(out, paint, u, S, w_i, mu_i, over)
 
     def step(i: mi.UInt32) -> tuple[mi.UInt32]:
+        # entry s of row j, by the exit k = s mod EXITS
         s = i * exits + k
         entry = entries(j * each * exits + s)
         if obj.textured is not None:
@@ -599,7 +648,7 @@ def _paint(obj: TranslucentObject, out: SurfacePoint) -> mi.Spectrum:
 
 
 def _brought(obj: TranslucentObject, prepared: Any, out: SurfacePoint, entry: EntrySample, u: mi.Point2f) -> _Brought:
-    """By entries of exits, along directions for pairs of uniform numbers."""
+    """S mu_i / (p(w_i) p(x_i)) of entries, along directions w_i for pairs of uniform numbers."""
     w_i, pdf = obj.proposals.sample_direction(entry, out, u)
     active = (entry.weight > 0) & (pdf > 0)
     over = dr.select(active, 1 / dr.maximum(pdf, 1e-8), 0)
@@ -623,22 +672,29 @@ def _collected(
         v = v.reshape(count, 1, -1, v.shape[1])
         return np.broadcast_to(v, (count, n // v.shape[2], *v.shape[2:])).reshape(count, n, -1)
 
+    # ---- S, cosines and reflectance, (points, entries, channels)
     S = np.array(brought.S, dtype=np.float32).T.reshape(count, n, -1)
     S = np.nan_to_num(S, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
     mu = dr.dot(out.w, out.n_out)
     mu_o, w_o = of_entries(mu), of_entries(out.w)
     R = np.array(paint, dtype=np.float32).T.reshape(count, -1, S.shape[2])[:, 0]
+
+    # ---- a(mu) fitted to S, and a mu_i over the density of directions at entries
     albedo = _fitted(obj, mu_o.ravel(), S.reshape(-1, S.shape[2]))
     if obj.textured is not None:
         albedo = _tilted(albedo, mu_o[:, :, 0], S, R)
     a = of_entries(mi.Spectrum(albedo(mu, paint)))
     cosine = np.array(albedo(brought.mu_i) * brought.over).T.reshape(S.shape) / albedo.whole.astype(np.float32)
     w_i, exits = np.array(brought.w_i, dtype=np.float32).T.reshape(count, n, 3), dr.width(out.w) // count
-    return DrawnEntries(S, cosine, near, known, w_i, w_o, a, albedo, np.maximum(R, 1e-20), entries, exits)
+    return DrawnEntries(
+        S=S, cosine=cosine, near=near, known=known, w_i=w_i, w_o=w_o, a=a, albedo=albedo, paint=np.maximum(R, 1e-20),
+        entries=entries, exits=exits,
+    )  # fmt: skip
 
 
 def _fitted(obj: TranslucentObject, mu: np.ndarray, S: np.ndarray) -> Albedo:
     """a(mu), by least squares over samples, of which `FITTED` are enough."""
+    # normal equations of the basis F_t(mu) mu^k, k = 0, 1, 2
     step = max(len(mu) // FITTED, 1)
     mu, S, eta = mu[::step], S[::step], float(obj.media[0].eta)
     basis = F_t(mu.astype(float), eta)[:, None] * mu[:, None] ** np.arange(3)
@@ -648,10 +704,13 @@ def _fitted(obj: TranslucentObject, mu: np.ndarray, S: np.ndarray) -> Albedo:
 
 def _tilted(albedo: Albedo, mu: np.ndarray, S: np.ndarray, paint: np.ndarray) -> Albedo:
     """With c that varies with the reflectance: by least squares over S of points, (points, samples, channels)."""
+    # x = ln R, and S over what even light would bring
     step, x = max(mu.size // FITTED, 1), np.log(np.maximum(paint, 1e-20))
     even = np.array(albedo(mi.Float(mu.ravel()))).T.reshape(S.shape).sum(axis=1) / np.maximum(S.sum(axis=1), 1e-30)
     mu, y = mu[:, ::step].astype(float), S[:, ::step] * even[:, None]
     powers, middle = F_t(mu, albedo.eta)[:, :, None] * mu[:, :, None] ** np.arange(3), x.mean(axis=0)
+
+    # normal equations of the basis F_t(mu) mu^k and (x - middle) F_t(mu) mu^k
     found = []
     for k in range(len(albedo.c)):
         basis = np.concatenate([powers, powers * (x[:, k] - middle[k])[:, None, None]], axis=2).reshape(-1, 6)
@@ -669,10 +728,13 @@ def _rows(
     The sum is that of S over those of alpha, or of a where that is not known, for the directions of a row. They are
     means over neighbours, of like colour where a is fitted.
     """
+    # Σ S / Σ a over the directions of a row
     even = S.mean(axis=1) / np.maximum(found.a.mean(axis=1), 1e-30)
     even = points.smoothed(points.smoothed(even, paint), paint)
     if obj.transport.alpha is None:
         return np.zeros(even.shape[1], dtype=bool), even
+
+    # Σ S / Σ alpha, smoothed more, as alpha has the detail
     j = mi.UInt32(np.repeat(np.arange(len(points), dtype=np.uint32), found.exits))
     out, face = points.exit_along(j, mi.Vector3f(found.w_o[:, : found.exits].reshape(-1, 3).T))
     alpha = np.array(obj.transport.alpha(obj.knowing(out, face), mi.Bool(True))[1], dtype=np.float32)
