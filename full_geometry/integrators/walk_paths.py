@@ -172,7 +172,7 @@ class LightVisitor:
         if self.forward:
             record = replace(record, run=record.run.onward(-si.to_world(si.wi)))
         left = self.left(record)
-        light = self.sampled_emitter(walk, si, self.media.boundary(walk.object), active & (dr.max(left) > 0))
+        light = self.sampled_emitter(walk, si, self.media.boundary(walk.object), active & (dr.max(dr.abs(left)) > 0))
         return walk, replace(record, L=record.L + left * light)
 
     @property
@@ -238,7 +238,7 @@ class LightVisitor:
         # p_e of next-event estimation at the last vertex; 0 where that had but one direction
         emitter = si.emitter(self.scene)
         left = self.left(record)
-        active = active & (emitter != None) & (dr.max(left) > 0)  # noqa: E711
+        active = active & (emitter != None) & (dr.max(dr.abs(left)) > 0)  # noqa: E711
         previous, sampled = interaction_of(record.previous, walk.medium), active & ~record.delta
         pdf, ds = emitter_pdf(self.scene, previous, si, sampled)
         pdf = dr.select(sampled, pdf, 0)
@@ -288,7 +288,7 @@ class LightVisitor:
         n = self.small.n_delta
         which = mi.Int32(draw(n, walk.rng)) if n > 1 else dr.zeros(mi.Int32, dr.width(walk.o))
         left = self.left(record)
-        active = active & record.scattered & record.delta & (dr.max(left) > 0)
+        active = active & record.scattered & record.delta & (dr.max(dr.abs(left)) > 0)
         directed = mi.Bool(False)
         if self.connections is not None:
             w_0, _ = self.small.direction(which, walk.o)

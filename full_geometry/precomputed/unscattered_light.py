@@ -365,7 +365,7 @@ class _Rays:
         own = met & (dr.dot(si.n, d) > 0)
         bs, value = sample_bsdf(media.boundary(self.k), si, rng, _only(mi.BSDFFlags.Reflection))
         new, _ = sided(si, bs.wo)
-        left = dr.max(ray.flux * value * T) / dr.maximum(ray.entered, 1e-30)
+        left = dr.max(dr.abs(ray.flux * value * T)) / dr.maximum(ray.entered, 1e-30)
         survive = dr.minimum(left / ROULETTE, 1)
         reflected = (dr.dot(si.n, new) < 0) & (rng.next_float32() < survive)
         d = mi.Vector3f(dr.select(own, new, d))
@@ -392,7 +392,7 @@ class _Rays:
         flux *= kept_forward(dr.dot(ray.d, d), m.g)
 
         # ---- roulette
-        survive = dr.minimum(dr.max(flux) / dr.maximum(ray.entered * ROULETTE, 1e-30), 1)
+        survive = dr.minimum(dr.max(dr.abs(flux)) / dr.maximum(ray.entered * ROULETTE, 1e-30), 1)
         alive = alive & flight.scatters & (rng.next_float32() < survive)
         at_event = replace(
             ray, o=mi.Point3f(ray.o + ray.d * t), d=d, off=media.behind(self.k, d),

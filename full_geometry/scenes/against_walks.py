@@ -61,11 +61,13 @@ def mean_ratios(scene: mi.Scene, image: np.ndarray, sensor: int = 0, seed: int =
     results = []
     for shape in translucent_shapes(scene):
         on = np.array(si.shape == mi.ShapePtr(shape))
-        I, W = shown[:, on].mean(axis=0), walked[:, on].mean(axis=0)
+        image_there, W = shown[:, on].mean(axis=0), walked[:, on].mean(axis=0)
         if on.sum() < SHOWN or not W.sum() > 0:
             continue
-        ratio = I.sum() / W.sum()
-        results.append(MeanRatio(shape.id(), float(ratio), float(np.sqrt(np.square(I - ratio * W).sum()) / W.sum())))
+        ratio = image_there.sum() / W.sum()
+        results.append(
+            MeanRatio(shape.id(), float(ratio), float(np.sqrt(np.square(image_there - ratio * W).sum()) / W.sum()))
+        )
     return results
 
 
