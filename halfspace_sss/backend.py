@@ -6,6 +6,7 @@ import ctypes
 import os
 import sys
 import time
+import warnings
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -51,10 +52,18 @@ def _candidates() -> list[str]:
 def prefer_bundled_llvm() -> None:
     """Point Dr.Jit at the LLVM that pip installed, unless the user set one; called when the package is imported.
 
-    Dr.Jit loads LLVM while it is imported itself and keeps it: what is set later has no effect.
+    Dr.Jit loads LLVM while it is imported itself and keeps it: what is set later has no effect. One that would abort
+    the process is warned of then, as scenes may be loaded before this package is asked for anything.
     """
+    if "drjit" in sys.modules:
+        import drjit as dr
+
+        version = dr.detail.llvm_version()
+        if version is not None and 0 <= version[0] < OLDEST_LLVM:
+            warnings.warn(f"LLVM would abort this process: {_told_of_loaded(version)}", stacklevel=3)
+        return
     bundled = sorted((Path(sys.prefix) / "lib").glob("libLLVM.so*"))
-    if bundled and "drjit" not in sys.modules:
+    if bundled:
         os.environ.setdefault("DRJIT_LIBLLVM_PATH", str(bundled[0]))
 
 
@@ -62,14 +71,19 @@ def _refuse_old_loaded_llvm() -> None:
     """Whichever LLVM Dr.Jit has loaded is the one that will compile."""
     import drjit as dr
 
-    version, given = dr.detail.llvm_version(), os.environ.get("DRJIT_LIBLLVM_PATH")
-    if version is not None and version[0] >= OLDEST_LLVM:
-        return
+    version = dr.detail.llvm_version()
+    if version is None or version[0] < OLDEST_LLVM:
+        raise BackendError(_told_of_loaded(version))
+
+
+def _told_of_loaded(version: tuple[int, int, int] | None) -> str:
+    """A sentence on the LLVM that Dr.Jit has loaded, which is too old, and what helps."""
+    given = os.environ.get("DRJIT_LIBLLVM_PATH")
     result = "no LLVM that it takes" if version is None or version[0] < 0 else "LLVM " + ".".join(map(str, version))
     remedy = "import halfspace_sss before drjit and mitsuba (`pip install karellen-llvm-core` brings an LLVM along)"
     if given and (_llvm_version(given) or 0) < OLDEST_LLVM:
         remedy = f"unset DRJIT_LIBLLVM_PATH = {given}"
-    raise BackendError(
+    return (
         f"Dr.Jit found {result} when it was imported, but it needs LLVM {OLDEST_LLVM} or newer: {remedy}, "
         "or set DRJIT_LIBLLVM_PATH before Python starts"
     )

@@ -22,7 +22,7 @@ QUERY = "1.0, 0.9, 0.0, 0.8, 0.5"
 USES = {
     "register": REGISTER,
     "set_variant after register": (
-        "import mitsuba as mi\nimport full_geometry as r\nfrom full_geometry.scenes import plugins\n"
+        "import mitsuba as mi\nimport full_geometry as r\nfrom full_geometry import plugins\n"
         "mi.set_variant('scalar_rgb')\nmi.detail.add_variant_callback(plugins._on_variant)\n"
         "mi.set_variant('llvm_ad_rgb')"
     ),
@@ -56,6 +56,14 @@ def test_an_old_llvm_that_drjit_has_loaded_is_refused_before_use(use: str) -> No
     if "mitsuba" in USES[use]:
         pytest.importorskip("mitsuba")
     assert run(OLD + USES[use]).startswith(f"halfspace_sss.backend.BackendError: {REFUSED}")
+
+
+def test_an_old_llvm_is_warned_of_when_the_package_is_imported_after_drjit() -> None:
+    """As Mitsuba loads scenes, and aborts, before `register` is called."""
+    for imported in ("halfspace_sss", "full_geometry"):
+        code = f"{OLD}import {imported}"
+        found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+        assert found.returncode == 0 and f"UserWarning: LLVM would abort this process: {REFUSED}" in found.stderr
 
 
 def test_no_llvm_at_all_is_refused_in_the_same_way() -> None:

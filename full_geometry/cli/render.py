@@ -276,4 +276,9 @@ def _error(reference: Reference) -> str:
     if reference.relative_error == 0:
         return "all passes are the same: the camera sees nothing that varies, such as the sky alone"
     told, share = f"relative standard error of the image {reference.relative_error:.2%}", reference.share_by_chance
-    return f"{told}, of the variance at most {share:.0%} light that orders 0 and 1 meet by chance" if share else told
+    if not share or share < 0.005:
+        return told
+    return (
+        f"{told}; up to {share:.0%} of the variance is from light that scattered at most once inside and then hit an "
+        "emitter by chance"
+    )

@@ -478,7 +478,9 @@ TRIALS = 256  # rays
 
 def name_of(shape: mi.Shape) -> str:
     """The id of a shape in quotes; what it may be, where it has none."""
-    return repr(shape.id()) if shape.id() else "without an id (Mitsuba merges meshes that have the same surface)"
+    if shape.id():
+        return repr(shape.id())
+    return "without an id (Mitsuba merges meshes that have the same surface; other shapes get one in the scene)"
 
 
 def _by_optix() -> bool:

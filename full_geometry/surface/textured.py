@@ -265,6 +265,8 @@ class TexturedMedium:
                 check_values(name, values, hint)
             if self.table is not None and name == "reflectance":
                 self.table.warn_of_clipped(values)
+                if obj is None:
+                    _warn_of_raw_bytes(texture)
 
 
 def _interaction(
@@ -318,13 +320,27 @@ def _in_channels(values: np.ndarray) -> np.ndarray:
     return np.broadcast_to(values, (len(values), n))
 
 
+def _warn_of_raw_bytes(texture: mi.Texture) -> None:
+    """Warn of colours in bytes that are read as linear values; such files hold sRGB."""
+    bitmaps = [node for node in mi.traverse(texture).hierarchy if kind_of(node) == "BitmapTexture"]
+    if any(_is_raw(each) and np.array(mi.traverse(each)["data"]).dtype == np.uint8 for each in bitmaps):
+        warnings.warn(
+            "reflectance is a bitmap of 8 bits that is read raw, as linear values: colours of such files are sRGB, "
+            "which raw = false decodes",
+            stacklevel=2,
+        )
+
+
+def _is_raw(bitmap: mi.Texture) -> bool:
+    return re.search(r"^  raw = (\d)", str(bitmap), re.MULTILINE).group(1) == "1"
+
+
 def _shown_by(bitmap: mi.Texture) -> np.ndarray:
     """What a bitmap shows at its texels, shape (rows, columns, channels); Mitsuba keeps bytes as they are in files."""
     data = np.array(mi.traverse(bitmap)["data"])
     if data.dtype != np.uint8:
         return data.astype(float)
-    raw = re.search(r"^  raw = (\d)", str(bitmap), re.MULTILINE).group(1) == "1"
-    return data / 255 if raw else linear_of_srgb(data / 255)
+    return data / 255 if _is_raw(bitmap) else linear_of_srgb(data / 255)
 
 
 def linear_of_srgb(values: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from halfspace_sss.noise_free import NoiseFree
 if TYPE_CHECKING:
     import pandas
 
-UNNAMED = "object without an id"
+UNNAMED = "object without an id (give its shape one in the scene)"
 DOUBT = 1.0  # standard errors that count as error: biases spread over decades, and few lie where less is told
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,15 @@ OPENPBR = {  # defaults of OpenPBR 1.1
     "subsurface_radius_scale": (1.0, 0.5, 0.25), "subsurface_scatter_anisotropy": 0.0, "specular_ior": 1.5,
     "specular_weight": 1.0,
 }  # fmt: skip
+NO_MEDIUM = {  # what of OpenPBR is in no medium, with the values by which it changes nothing
+    "subsurface_weight": 1.0, "base_metalness": 0.0, "transmission_weight": 0.0, "coat_weight": 0.0,
+    "fuzz_weight": 0.0, "thin_film_weight": 0.0, "emission_luminance": 0.0, "geometry_opacity": 1.0,
+    "specular_color": (1.0, 1.0, 1.0), "specular_roughness": 0.0,
+}  # fmt: skip
+ROUGHNESS = 0.3  # of OpenPBR 1.1 where none is written
+TAKEN_OF_GLTF = ("KHR_materials_volume_scatter", "KHR_materials_volume", "KHR_materials_ior")
+WEIGHED = ("base", "transmission", "coat", "fuzz", "thin_film", "emission")  # groups of inputs, each with a weight
+THIN = "a thin wall has no inside, whose light a medium could be"
 TO_REC709 = {  # linear, by the name of a colour space in MaterialX
     "": np.eye(3),
     "lin_rec709": np.eye(3),
@@ -34,12 +44,13 @@ def import_materials(path: str | os.PathLike, mm_per_unit: float | None = None) 
     """The materials of a MaterialX file (.mtlx) with OpenPBR surfaces, or of a glTF file (.glb, .gltf) that scatter.
 
     Args:
-        path: the file; surfaces without subsurface scattering are left out.
+        path: the file; surfaces without subsurface scattering are left out. Of the others one warning names what
+            changes the picture and is no part of a medium, such as roughness, coats and partial weights.
         mm_per_unit: length of a unit of the file, by default 1 mm in MaterialX and a metre in glTF.
 
     Raises:
-        ValueError: the file cannot be read, holds no subsurface scattering, or has values that no medium has; file,
-            material and value are named.
+        ValueError: the file cannot be read, holds no subsurface scattering, has values that no medium has, or
+            scatters inside thin walls; file, material and value are named.
         BackendError: the package that reads the file is not installed.
     """
     path = Path(path)
@@ -71,12 +82,44 @@ def _of_materialx(path: Path, unit: float) -> Iterator[Material]:
         name = names.get(node.getName(), node.getName())
         try:
             values = {key: _value(node, key, default) for key, default in OPENPBR.items()}
-            if values.pop("subsurface_weight") > 0:
+            if values.pop("subsurface_weight") > 0 and _written(node).get("base_metalness") != 1:
+                if node.getInputValue("geometry_thin_walled"):
+                    raise ValueError(f"geometry_thin_walled must be false, got true: {THIN}")
+                _warn_of(path, name, _not_taken(node))
                 values["specular_ior"] = _modulated(values["specular_ior"], values.pop("specular_weight"))
                 medium = Medium.from_openpbr(**values, mm_per_unit=unit)
                 yield Material(name, medium, CHANNELS, set="OpenPBR", source=str(path))
         except ValueError as error:
             raise ValueError(f"{path}: material {name!r}: {error}") from error
+
+
+def _written(node: Any) -> dict[str, Any]:
+    """The inputs that a node writes: numbers, tuples and texts; "a connection" where it has no value."""
+    results = {}
+    for each in node.getActiveInputs():
+        value = "a connection" if each.getValue() is None else each.getValue()
+        value = tuple(round(v, 6) for v in value.asTuple()) if hasattr(value, "asTuple") else value
+        results[each.getName()] = round(value, 6) if isinstance(value, float) else value  # they are of single precision
+    return results
+
+
+def _not_taken(node: Any) -> dict[str, Any]:
+    """What changes the picture of a surface and is in no medium, with its values."""
+    written = {"specular_roughness": ROUGHNESS} | _written(node)
+    found = {key: written[key] for key, none in NO_MEDIUM.items() if written.get(key, none) != none}
+    mixed = [group for group in WEIGHED if any(key.startswith(group) for key in found)]
+    if not {"subsurface_weight", "base_metalness"}.isdisjoint(found):
+        mixed.append("base")
+    by_others = {key: value for key, value in written.items() if key.startswith(tuple(mixed))}
+    geometry = {key: value for key, value in written.items() if key.startswith("geometry_") and value == "a connection"}
+    return found | by_others | geometry
+
+
+def _warn_of(path: Path, name: str, not_taken: dict[str, Any]) -> None:
+    """One warning of all that changes the picture of a material and is in no medium."""
+    if not_taken:
+        told = ", ".join(f"{key} = {value}" for key, value in not_taken.items())
+        warnings.warn(f"{path}: material {name!r}: its medium alone is imported, without {told}", stacklevel=4)
 
 
 def _value(node: Any, key: str, default: Any) -> Any:
@@ -115,15 +158,30 @@ def _of_gltf(path: Path, unit: float) -> Iterator[Material]:
         scatter, volume = parts.get("KHR_materials_volume_scatter"), parts.get("KHR_materials_volume", {})
         if scatter is None:
             continue
+        surface = material.pbrMetallicRoughness or pygltflib.PbrMetallicRoughness()
+        not_taken = _not_taken_of_gltf(material, surface, parts)
         color = scatter.get("multiscatterColor", scatter.get("multiscatterColorFactor", (0.0, 0.0, 0.0)))
         distance = volume.get("attenuationDistance", math.inf) * unit / 1000
         tint = volume.get("attenuationColor", (1.0, 1.0, 1.0))
         ior = parts.get("KHR_materials_ior", {}).get("ior", 1.5)
         try:
+            if volume.get("thicknessFactor", 0.0) == 0:
+                raise ValueError(f"thicknessFactor must be > 0, got 0: {THIN}")
+            _warn_of(path, name, not_taken)
             medium = Medium.from_gltf(color, distance, tint, scatter.get("scatterAnisotropy", 0.0), ior)
             yield Material(name, medium, CHANNELS, set="glTF", source=str(path))
         except ValueError as error:
             raise ValueError(f"{path}: material {name!r}: {error}") from error
+
+
+def _not_taken_of_gltf(material: Any, surface: Any, parts: dict[str, Any]) -> dict[str, Any]:
+    """What changes the picture of a material of glTF and is in no medium, with its values."""
+    none = {"baseColorFactor": [1.0] * 4, "metallicFactor": 0.0, "roughnessFactor": 0.0, "emissiveFactor": [0.0] * 3}
+    owners = [vars(surface), vars(material), *(parts.get(name, {}) for name in TAKEN_OF_GLTF)]
+    written = {key: value for owner in owners for key, value in owner.items() if value is not None}
+    factors = {key: written[key] for key in none if written.get(key, none[key]) != none[key]}
+    textures = {key: "a texture" for key in written if key.endswith("Texture")}
+    return factors | textures | {key: value for key, value in parts.items() if key not in TAKEN_OF_GLTF}
 
 
 def to_toml(materials: list[Material]) -> str:

@@ -236,6 +236,19 @@ def test_one_pass_claims_no_error(scene: Path) -> None:
     assert "inf" not in result.stdout + result.stderr
 
 
+@pytest.mark.parametrize(("share", "told"), [(0.0, False), (0.004, False), (0.3, True)])
+def test_light_met_by_chance_is_told_in_a_sentence_where_it_is_a_share_of_the_noise(share: float, told: bool) -> None:
+    from full_geometry.cli.render import _error
+    from full_geometry.scenes.reference_store import BY_CHANCE, Reference
+
+    image = np.full((2, 2, 3), 1.0)
+    whole = 4 * 3 * 0.01  # of the variance of all pixels
+    about = {BY_CHANCE: share * whole * 8**2}
+    known = Reference(mean=image, variance=0.01 * image, passes=2, spp=8, seconds=1.0, about=about)
+    sentence = "; up to 30% of the variance is from light that scattered at most once inside and then hit an emitter by"
+    assert (sentence in _error(known)) == told and "variance" not in _error(known).replace(sentence, "")
+
+
 @pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
 @pytest.mark.parametrize("model", ["better_dipole", "path_traced"])
 @pytest.mark.parametrize("after", [0.05, 0.5, 1.0, 1.5, 2.0])

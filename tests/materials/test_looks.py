@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -119,15 +120,20 @@ MTLX = """<?xml version="1.0"?>
     <input name="subsurface_weight" type="float" value="{weight}" />
     <input name="subsurface_color" type="color3" {color} />
     <input name="subsurface_radius_scale" type="color3" value="0.482, 0.169, 0.109" />
+    {more}
   </open_pbr_surface>
 </materialx>
 """
 COLOR = 'value="0.623, 0.433, 0.343"'
 
 
-def mtlx(folder: Path, space: str = "lin_rec709", weight: float = 1.0, color: str = COLOR) -> Path:
+SMOOTH = '<input name="specular_roughness" type="float" value="0" />'
+THIN = '<input name="geometry_thin_walled" type="boolean" value="true" />'
+
+
+def mtlx(folder: Path, space: str = "lin_rec709", weight: float = 1.0, color: str = COLOR, more: str = SMOOTH) -> Path:
     path = folder / "skin.mtlx"
-    path.write_text(MTLX.format(space=space, weight=weight, color=color))
+    path.write_text(MTLX.format(space=space, weight=weight, color=color, more=more))
     return path
 
 
@@ -154,7 +160,47 @@ FILES = [
     ({"color": 'nodename="texture"'}, "subsurface_color must be a value, got a connection"),
     ({"color": 'value="1.5, 0.4, 0.3"'}, r"subsurface_color must be in \[0, 1\]"),
     ({"color": "<"}, "must be a MaterialX document"),
+    ({"more": THIN}, "material 'Skin': geometry_thin_walled must be false, got true: a thin wall has no inside"),
+    ({"more": '<input name="base_metalness" type="float" value="1" />'}, "must hold a material with subsurface scat"),
 ]
+
+
+def number(name: str, value: object, kind: str = "float") -> str:
+    return f'<input name="{name}" type="{kind}" value="{value}" />'
+
+
+NOT_TAKEN = [  # inputs of a surface, and what the warning says is not taken
+    ("", 1.0, "specular_roughness = 0.3"),
+    (
+        SMOOTH + number("coat_weight", 0.5) + number("coat_roughness", 0.2), 1.0,
+        "coat_weight = 0.5, coat_roughness = 0.2",
+    ),
+    (
+        SMOOTH + number("base_color", "0.5, 0.25, 0", "color3") + number("base_weight", 0.5), 0.75,
+        "subsurface_weight = 0.75, base_color = (0.5, 0.25, 0.0), base_weight = 0.5",
+    ),
+    (number("transmission_weight", 0.5), 1.0, "transmission_weight = 0.5, specular_roughness = 0.3"),
+    (SMOOTH + '<input name="geometry_normal" type="vector3" nodename="m" />', 1.0, "geometry_normal = a connection"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("more", "weight", "told"), NOT_TAKEN)
+def test_one_warning_lists_what_an_import_leaves_out(more: str, weight: float, told: str, tmp_path: Path) -> None:
+    pytest.importorskip("MaterialX")
+    with pytest.warns(UserWarning) as warned:
+        (found,) = import_materials(mtlx(tmp_path, weight=weight, more=more))
+    (message,) = [str(w.message) for w in warned]
+    assert message.endswith(f"skin.mtlx: material 'Skin': its medium alone is imported, without {told}")
+    assert found.name == "Skin"
+
+
+def test_an_import_that_leaves_nothing_out_does_not_warn(tmp_path: Path) -> None:
+    """Colour and roughness of layers without weight, and of a base that is all subsurface, change nothing."""
+    pytest.importorskip("MaterialX")
+    unseen = number("base_color", "0.5, 0.25, 0", "color3") + number("coat_roughness", 0.2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        import_materials(mtlx(tmp_path, more=SMOOTH + unseen))
 
 
 @pytest.mark.parametrize(("changes", "message"), FILES)
@@ -164,14 +210,18 @@ def test_materialx_that_holds_no_medium_is_refused(changes: dict, message: str, 
         import_materials(mtlx(tmp_path, **changes))
 
 
-def glb(folder: Path) -> Path:
+def glb(folder: Path, thickness: float = 0.1, metallic: float = 0.0, **more: dict) -> Path:
     pygltflib = pytest.importorskip("pygltflib")
     extensions = {
         "KHR_materials_volume_scatter": {"multiscatterColor": [0.572, 0.227, 0.075], "scatterAnisotropy": 0.3},
         "KHR_materials_volume": {"attenuationColor": [0.9, 0.8, 0.7], "attenuationDistance": 0.01},
         "KHR_materials_ior": {"ior": 1.4},
+        **more,
     }
-    model = pygltflib.GLTF2(materials=[pygltflib.Material(name="wax", extensions=extensions), pygltflib.Material()])
+    extensions["KHR_materials_volume"]["thicknessFactor"] = thickness
+    surface = pygltflib.PbrMetallicRoughness(metallicFactor=metallic, roughnessFactor=0.0)
+    wax = pygltflib.Material(name="wax", extensions=extensions, pbrMetallicRoughness=surface)
+    model = pygltflib.GLTF2(materials=[wax, pygltflib.Material()])
     model.save(str(folder / "wax.glb"))
     return folder / "wax.glb"
 
@@ -180,6 +230,19 @@ def test_gltf_comes_in_with_name_and_medium_and_leaves_other_materials_out(tmp_p
     (found,) = import_materials(glb(tmp_path))
     assert found.name == "wax"
     assert found.medium == Medium.from_gltf([0.572, 0.227, 0.075], 0.01, [0.9, 0.8, 0.7], 0.3, 1.4)
+
+
+def test_gltf_warns_once_of_what_it_leaves_out_and_refuses_thin_walls(tmp_path: Path) -> None:
+    sheen = {"KHR_materials_sheen": {"sheenRoughnessFactor": 0.5}}
+    with pytest.warns(UserWarning) as warned:
+        import_materials(glb(tmp_path, metallic=0.5, **sheen))
+    (message,) = [str(w.message) for w in warned]
+    wanted = "metallicFactor = 0.5, KHR_materials_sheen = {'sheenRoughnessFactor': 0.5}"
+    assert message.endswith(f"wax.glb: material 'wax': its medium alone is imported, without {wanted}")
+    with pytest.raises(
+        ValueError, match="wax.glb: material 'wax': thicknessFactor must be > 0, got 0: a thin wall has"
+    ):
+        import_materials(glb(tmp_path, thickness=0.0))
 
 
 def test_files_of_other_kinds_and_broken_ones_are_refused(tmp_path: Path) -> None:

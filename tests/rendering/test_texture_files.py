@@ -56,6 +56,7 @@ def _file(folder: Path, kind: str, raw: bool) -> dict:
 def _inside(parameter: str, texture: Any) -> Any:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", "reflectance is a bitmap of 8 bits that is read raw")
         surface = {"type": "translucent", parameter: texture, **SURFACES[parameter], "eta": 1.4}
         return mi.load_dict(surface).spec
 
@@ -82,6 +83,18 @@ def test_a_texture_of_every_kind_is_the_medium_of_its_colours(
     shown = [np.array(value) + np.zeros((3, 2)) for value in (at.albedo, at.sigma_t)]
     for a, b in zip(shown, found.textured.values_on(sphere)):
         np.testing.assert_allclose(a.T, np.broadcast_to(b, (4, 3))[:2], rtol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["8 bits", "alpha", "grey", "16 bits", "float"])
+def test_colours_in_bytes_that_are_read_raw_are_warned_of(tmp_path: Path, kind: str) -> None:
+    """Once, for reflectance, which people paint; a linear file of 8 bits and one of more bits do not warn."""
+    told = []
+    for parameter, raw in (("reflectance", True), ("reflectance", False), ("albedo", True)):
+        with warnings.catch_warnings(record=True) as found:
+            warnings.simplefilter("always")
+            mi.load_dict({"type": "translucent", parameter: _file(tmp_path, kind, raw), **SURFACES[parameter]})
+        told.append([str(w.message) for w in found if "8 bits that is read raw, as linear values" in str(w.message)])
+    assert [len(each) for each in told] == [int(kind in ("8 bits", "alpha", "grey")), 0, 0]
 
 
 def test_the_example_of_the_guide_has_the_colours_of_its_file(tmp_path: Path) -> None:
