@@ -14,7 +14,8 @@ from full_geometry.trade.image_differences import srgb
 from halfspace_sss.comparison.style import paper, saved
 
 
-def _scenes() -> dict[str, list[Shot]]:
+@pytest.fixture(scope="module")
+def scenes() -> dict[str, list[Shot]]:
     rng = np.random.default_rng(1)
     scenes = {}
     for name in ("marble", "ketchup"):
@@ -22,11 +23,6 @@ def _scenes() -> dict[str, list[Shot]]:
         near, far = (compared(label, reference * s, reference) for label, s in (("near", 1.05), ("far", 1.8)))
         scenes[name] = [Shot("path traced", reference, {"time, s": 3600.0}), far, near, absent("later", "to come")]
     return scenes
-
-
-@pytest.fixture(scope="module")
-def scenes() -> dict[str, list[Shot]]:
-    return _scenes()
 
 
 @pytest.fixture(scope="module")
@@ -97,19 +93,31 @@ def test_images_without_maps_or_crops_make_a_figure(scenes: dict[str, list[Shot]
 
 
 @pytest.mark.parametrize(
-    ("arguments", "options", "message"),
+    ("options", "message"),
     [
-        ({}, {}, "scenes must hold at least one scene"),
-        ({"s": [absent("a")]}, {}, "scene 's' must start with the image of its reference"),
-        (_scenes(), {"crops": {"marble": [Crop(10, 0, 8, 4)]}}, "crops of 'marble' must lie inside 16 x 12 pixels"),
-        (_scenes(), {"crops": {"marble": [Crop(0, 0, 0, 4)]}}, "crops of 'marble' must lie inside"),
-        (_scenes(), {"crops": {"marble": [Crop(0, 0, 4, 4)] * 4}}, "crops of 'marble' must be 3 at most, got 4"),
-        (_scenes(), {"exposures": {"marbel": 1.0}}, "exposures must be of the scenes marble, ketchup, got 'marbel'"),
+        ({"crops": {"marble": [Crop(10, 0, 8, 4)]}}, "crops of 'marble' must lie inside 16 x 12 pixels"),
+        ({"crops": {"marble": [Crop(0, 0, 0, 4)]}}, "crops of 'marble' must lie inside"),
+        ({"crops": {"marble": [Crop(0, 0, 4, 4)] * 4}}, "crops of 'marble' must be 3 at most, got 4"),
+        ({"exposures": {"marbel": 1.0}}, "exposures must be of the scenes marble, ketchup, got 'marbel'"),
     ],
 )
-def test_bad_input_is_refused(arguments: Any, options: dict[str, Any], message: str) -> None:
+def test_crops_and_exposures_of_nothing_are_refused(
+    scenes: dict[str, list[Shot]], options: dict[str, Any], message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
-        image_grid(arguments, **options)
+        image_grid(scenes, **options)
+
+
+@pytest.mark.parametrize(
+    ("scenes", "message"),
+    [
+        ({}, "scenes must hold at least one scene"),
+        ({"s": [absent("a")]}, "scene 's' must start with the image of its reference"),
+    ],
+)
+def test_scenes_without_a_reference_are_refused(scenes: dict[str, list[Shot]], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        image_grid(scenes)
 
 
 def test_what_noise_brings_below_zero_counts_as_zero() -> None:
