@@ -10,7 +10,8 @@ import numpy as np
 
 from analytic_models._diffusion import unit_gauss
 from halfspace_sss.checks import check_choice
-from halfspace_sss.interface.model import BSSRDF, Query
+from halfspace_sss.interface.model import BSSRDF
+from halfspace_sss.interface.query import Query
 from halfspace_sss.physics.fresnel import boundary_A, sine
 from halfspace_sss.physics.medium import Medium
 

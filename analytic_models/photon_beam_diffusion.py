@@ -7,7 +7,8 @@ from typing import Any
 
 from analytic_models._diffusion import DiffuseBoundary, Grosjean, safe_differences, unit_gauss
 from halfspace_sss.checks import check_choice
-from halfspace_sss.interface.model import BSSRDF, Query
+from halfspace_sss.interface.model import BSSRDF
+from halfspace_sss.interface.query import Query
 from halfspace_sss.physics.fresnel import sine
 from halfspace_sss.physics.medium import Medium
 

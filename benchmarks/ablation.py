@@ -21,7 +21,8 @@ from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count
 from halfspace_sss.comparison.model_errors import TracedMaps, model_error, reference_maps
 from halfspace_sss.executors import completed
-from halfspace_sss.interface.model import BSSRDF, Query
+from halfspace_sss.interface.model import BSSRDF
+from halfspace_sss.interface.query import Query
 from halfspace_sss.maps.noisy_maps import draw_directions, make_pool, radial_edges
 from halfspace_sss.neural.features import N_FEATURES
 from halfspace_sss.neural.hypernetwork import in_range

@@ -22,9 +22,9 @@ from full_geometry.trade.results import ObjectTrade
 from full_geometry.trade.ways import Stage, Way
 from halfspace_sss.backend import clock
 from halfspace_sss.comparison.model_errors import model_error, references
-from halfspace_sss.interface.model import model_class
 from halfspace_sss.neural.network import Network
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.registry import model_class
 
 ENTRIES, NODES = (1, 2, 4, 8), (4, 8, 16, 32, 64)
 BEAMS, USUAL_NODES, QUERIES = "photon_beam_diffusion", 16, 2**14

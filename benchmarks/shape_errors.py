@@ -20,10 +20,10 @@ from full_geometry.learning.shape_data import draw_object
 from full_geometry.objects.objects import TranslucentObject, object_of
 from full_geometry.transport.any_shape import transport
 from full_geometry.transport.descriptors import mean_chord
-from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.materials import load as load_material
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
+from halfspace_sss.registry import bssrdf
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 # ----------------------------------------------------------------------------------------------------

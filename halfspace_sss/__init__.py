@@ -29,10 +29,11 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from halfspace_sss import materials, measure, neural
     from halfspace_sss.comparison.reflectance_curves import curves
-    from halfspace_sss.interface.model import BSSRDF, bssrdf, models, register_model
+    from halfspace_sss.interface.model import BSSRDF
     from halfspace_sss.maps.store import make_maps
     from halfspace_sss.physics.layers import Layers
     from halfspace_sss.physics.medium import Medium
+    from halfspace_sss.registry import bssrdf, models, register_model
     from halfspace_sss.tracing.tracer import trace
 
 prefer_bundled_llvm()
@@ -58,14 +59,14 @@ __getattr__, __dir__ = lazy_names(
         "BSSRDF": "interface.model",
         "Layers": "physics.layers",
         "Medium": "physics.medium",
-        "bssrdf": "interface.model",
+        "bssrdf": "registry",
         "curves": "comparison.reflectance_curves",
         "make_maps": "maps.store",
         "materials": "",
         "measure": "",
-        "models": "interface.model",
+        "models": "registry",
         "neural": "",
-        "register_model": "interface.model",
+        "register_model": "registry",
         "trace": "tracing.tracer",
     },
 )

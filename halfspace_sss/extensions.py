@@ -19,7 +19,7 @@ from typing import Any
 COMMANDS, MODELS = "halfspace_sss.commands", "halfspace_sss.models"
 LEARNERS, TRANSPORTS = "halfspace_sss.learners", "halfspace_sss.transports"
 FAILURES = (Exception, SystemExit)  # what code of somebody else may end with
-OWN = "halfspace-sss"  # the distribution whose entry points come first
+OWN = "halfspace-sss"  # the distribution of this project
 
 
 def warn_left_out(group: str, name: str, error: object) -> None:
@@ -33,13 +33,13 @@ def offers(group: str) -> dict[str, EntryPoint]:
     """The entry points by which packages of others join a group, the first of each name; none is loaded."""
     results: dict[str, EntryPoint] = {}
     for entry in entry_points(group=group):
-        if entry.dist is None or entry.dist.name != OWN:
+        if not _is_own(entry):
             results.setdefault(entry.name, entry)
     return results
 
 
-def _entries(group: str) -> list[EntryPoint]:
-    return sorted(entry_points(group=group), key=lambda e: e.dist is None or e.dist.name != OWN)
+def _is_own(entry: EntryPoint) -> bool:
+    return entry.dist is not None and entry.dist.name == OWN
 
 
 def loaded(entry: EntryPoint) -> Any:
@@ -51,10 +51,10 @@ def loaded(entry: EntryPoint) -> Any:
         return None
 
 
-def offered(group: str) -> Iterator[tuple[str, Any]]:
-    """Name and object of every entry point of a group that loads, those of this project first."""
-    for entry in _entries(group):
-        if (result := loaded(entry)) is not None:
+def offered(group: str, own: bool = False) -> Iterator[tuple[str, Any]]:
+    """Name and object of every entry point of a group that loads, of packages of others or of this project."""
+    for entry in entry_points(group=group):
+        if _is_own(entry) == own and (result := loaded(entry)) is not None:
             yield entry.name, result
 
 

@@ -22,7 +22,7 @@ SOURCES = sorted(path for package in ORDER for path in (ROOT / package).rglob("*
 HEAVY = ["torch", "mitsuba", "matplotlib", "drjit", "pandas", "xarray"]
 FLOORS = {  # of each package, a room or file may import those to its left; "" is all other files
     "halfspace_sss": [
-        "", "physics", "interface", "tracing", "maps", "measure", "materials", "comparison", "neural",
+        "", "physics", "interface", "neural", "registry", "tracing", "maps", "measure", "materials", "comparison",
         "neural.training", "cli",
     ],
     "full_geometry": [

@@ -14,9 +14,9 @@ import pytest
 import halfspace_sss
 from analytic_models import MODELS
 from analytic_models.standard_dipole import StandardDipole
-from halfspace_sss import Medium, extensions
-from halfspace_sss.interface import model as interface
+from halfspace_sss import Medium, extensions, registry
 
+OWN = [cls.name for cls in (*MODELS, *halfspace_sss.neural.MODELS)]
 START = [sys.executable, "-c", "from figures.command_line import main; main()"]
 QUICK = ["curves", "--theta-i", "0", "--paths", "256", "--model", "standard_dipole", "--out", "out"]
 
@@ -74,14 +74,14 @@ def _model(**members: Any) -> type:
 def test_models_that_are_none_are_left_out(offer: Any, wrong: Any, why: str) -> None:
     offer(Entry("broken", wrong), Entry("analytic", MODELS, "analytic_models:MODELS"))
     with pytest.warns(UserWarning) as found:
-        models = interface._installed.__wrapped__()
-    assert list(models) == [cls.name for cls in MODELS]
+        models = registry._installed.__wrapped__()
+    assert list(models) == OWN
     assert [str(w.message).startswith(f"entry point 'broken' is left out: {why}") for w in found] == [True]
 
 
 def test_models_of_other_packages_join_behind(offer: Any) -> None:
     offer(Entry("more", [_model()]), Entry("analytic", MODELS, "analytic_models:MODELS"))
-    assert list(interface._installed.__wrapped__()) == [*(cls.name for cls in MODELS), "other"]
+    assert list(registry._installed.__wrapped__()) == [*OWN, "other"]
 
 
 def _install(folder: Path, code: str, *entries: str) -> dict[str, str]:
@@ -143,5 +143,5 @@ def test_a_class_without_orders_cannot_be_registered() -> None:
 
 def test_a_sound_model_of_a_package_answers(offer: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     offer(Entry("more", [_model()]))
-    monkeypatch.setattr(interface, "_installed", interface._installed.__wrapped__)
+    monkeypatch.setattr(registry, "_installed", registry._installed.__wrapped__)
     assert halfspace_sss.bssrdf("other", Medium(1.0, 0.1)).eval(1.0, 0.9, 0.0, 0.8, 0.0) > 0

@@ -16,8 +16,8 @@ import numpy as np
 
 from figures.parts.code import code_hash
 from halfspace_sss.checks import check_choice, check_interval
-from halfspace_sss.interface.model import no_models
 from halfspace_sss.progress import Progress
+from halfspace_sss.registry import no_models
 
 QUALITIES = ("draft", "paper")
 

@@ -17,8 +17,8 @@ from full_geometry.surface.translucent import VARIABLE
 from full_geometry.surface.wrapped import surface_of
 from full_geometry.transport.models import lookup
 from halfspace_sss.checks import check_choice
-from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.neural.universal import Neural
+from halfspace_sss.registry import bssrdf
 
 NAMES = ("albedo", "sigma_t", "mfp", "g")
 ALBEDO = (1e-4, 1 - 1e-5)  # bounds

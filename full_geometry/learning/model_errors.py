@@ -32,9 +32,9 @@ from full_geometry.transport.one_object import HalfSpace
 from full_geometry.transport.patches import ExitTable
 from full_geometry.transport.storing import KIND, find_weights, load
 from halfspace_sss.checks import check_count
-from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
+from halfspace_sss.registry import bssrdf
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 LOBES = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3.0)

@@ -15,9 +15,9 @@ from full_geometry.surface.wrapped import surface_of
 from full_geometry.transport.models import model_names
 from full_geometry.transport.storing import KIND, find_weights, trained
 from halfspace_sss.checks import check_count
-from halfspace_sss.interface.model import models as half_space_models
 from halfspace_sss.neural.store import check_weights_folder, load_weights
 from halfspace_sss.progress import NamedProgress
+from halfspace_sss.registry import models as half_space_models
 
 
 def untrained(scene: Any) -> list[str]:

@@ -56,9 +56,9 @@ from full_geometry.surface.translucent import MediumSpec, check_boundary
 from full_geometry.surface.varying import VaryingMedium, equivalent
 from full_geometry.surface.wrapped import Wrapping, surface_of, wrapping_of
 from halfspace_sss import measure
-from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.registry import bssrdf
 
 
 @dataclass(frozen=True, eq=False)

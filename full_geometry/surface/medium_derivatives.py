@@ -19,8 +19,8 @@ import mitsuba as mi
 
 from full_geometry.geometry.points import SurfacePoint, Transport, TransportAround, opaque
 from full_geometry.surface.translucent import VARIABLE
-from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.registry import bssrdf
 
 STEP = 0.01
 STENCILS = (  # offsets of both sides over h; coefficients, of what is between them too, times h

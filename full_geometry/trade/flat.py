@@ -19,11 +19,12 @@ from full_geometry.trade.results import html_table, plain
 from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.comparison.curve_set import TRACED
 from halfspace_sss.comparison.model_errors import TracedMaps, model_error, references
-from halfspace_sss.interface.model import BSSRDF, bssrdf
-from halfspace_sss.interface.model import models as registered
+from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.neural.symmetric import channels
 from halfspace_sss.noise_free import NoiseFree
 from halfspace_sss.physics.medium import Medium, medium_of
+from halfspace_sss.registry import bssrdf
+from halfspace_sss.registry import models as registered
 
 if TYPE_CHECKING:
     import pandas

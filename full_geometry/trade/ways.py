@@ -18,7 +18,7 @@ from full_geometry.scenes.scene_files import PATH_TRACED, load_objects
 from full_geometry.trade.soft_light import SoftLight
 from full_geometry.transport.models import model_names
 from halfspace_sss.checks import check_choice
-from halfspace_sss.interface.model import model_class, models
+from halfspace_sss.registry import model_class, models
 
 LAMBERT = "lambert"
 NO_SINGLE = "without single scattering"

@@ -53,11 +53,12 @@ from full_geometry.transport.exit_pairs import EntryProposals, trace_exits, trac
 from full_geometry.transport.features import Side
 from full_geometry.transport.half_space import HalfSpaceProposals, area_share
 from full_geometry.transport.one_object import HalfSpace
-from halfspace_sss.interface.model import BSSRDF, bssrdf
+from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.lazy import once
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.neural.store import checksum_of, load_weights
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.registry import bssrdf
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 # ---- What the network of all shapes is trained on, and warns outside of ----------------------------

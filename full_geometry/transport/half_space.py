@@ -28,8 +28,9 @@ from full_geometry.geometry.rounding import ray_from
 from full_geometry.geometry.shape import Geometry, lines_through, meet_alone
 from full_geometry.settings import AUTOMATIC, Settings
 from full_geometry.surface.textured import TexturedMedium
-from halfspace_sss.interface.model import BSSRDF, bssrdf
+from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.registry import bssrdf
 
 POINTS_PER_RATIO, MOST_POINTS = 60.0, 9  # candidates over the area
 

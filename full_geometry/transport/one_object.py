@@ -34,9 +34,10 @@ from full_geometry.transport.features import (
 )
 from full_geometry.transport.half_space import in_double
 from full_geometry.transport.palette import palette_of
-from halfspace_sss.interface.model import BSSRDF, bssrdf
+from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.physics import fresnel
+from halfspace_sss.registry import bssrdf
 
 FLOOR = 1e-2  # reflectance of the floor, over that of the half-space
 

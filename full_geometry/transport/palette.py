@@ -53,11 +53,13 @@ from full_geometry.surface.textured import MediumAt, TexturedMedium, bend, x_of_
 from full_geometry.transport.half_space import HalfSpaceProposals, area_share, radial_table
 from halfspace_sss import measure
 from halfspace_sss.arrays import broadcast_query
-from halfspace_sss.interface.model import BSSRDF, Query, bssrdf
+from halfspace_sss.interface.model import BSSRDF
+from halfspace_sss.interface.query import Query
 from halfspace_sss.neural.reduced import MODES, ReducedNetworks, shape_over_power
 from halfspace_sss.neural.symmetric import SymmetricModel
 from halfspace_sss.physics.fresnel import F_t
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.registry import bssrdf
 
 NODES = 32  # over all albedos
 LEAST = 1e-4  # albedo that stands for less at nodes

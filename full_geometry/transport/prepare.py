@@ -112,7 +112,8 @@ def _make_object(geometry: Geometry, spec: MediumSpec, settings: Settings) -> Tr
     if transport and transport.orders == "total" and spec.orders == "multiple":
         raise ValueError(f"orders must be total for the model {spec.model!r}, which contains them all, got multiple")
     low_orders = _low_orders(spec, transport)
-    transport = DifferentiableTransport(transport, derivatives) if hasattr(transport, "perturbed") else transport
+    if transport is not None and capabilities.derivatives and obj.textured is None and obj.spectral is None:
+        transport = DifferentiableTransport(transport, derivatives)
     entries = entries if settings.entries == AUTOMATIC else settings.entries
     return replace(
         obj, transport=transport, proposals=proposals, entries=entries, low_orders=low_orders,

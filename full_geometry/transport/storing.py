@@ -28,10 +28,10 @@ from full_geometry.transport import any_shape as shapes
 from full_geometry.transport.features import REFLECTIONS, BaseModel, ObjectFrame, n_local, n_pair, n_side, surroundings
 from full_geometry.transport.one_object import DirectionalAlbedo, FullGeometry, HalfSpace
 from full_geometry.transport.patches import Patches, PatchSampler
-from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.neural.store import load_weights, save_weights, weights_folder
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import path_of
+from halfspace_sss.registry import bssrdf
 
 ANCHORS = 256
 CLOSE = 1e-4  # positions over the size of the object, coefficients relative

@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 
 from halfspace_sss.backend import array_types
-from halfspace_sss.interface.model import bssrdf, models
 from halfspace_sss.maps.grid import MapGrid
 from halfspace_sss.maps.map_tracing import MapUnit, trace_unit
 from halfspace_sss.measure import reflectance, weight_variance
 from halfspace_sss.physics.fresnel import F_r, F_t
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.physics.reflectance import _inverse
+from halfspace_sss.registry import bssrdf, models
 from halfspace_sss.tracing.tallies import AngularTally, FluxTally
 from halfspace_sss.tracing.walk import pass_seed, walk
 

@@ -18,7 +18,7 @@ import numpy as np
 from halfspace_sss.arrays import library
 from halfspace_sss.comparison.cell_energies import cell_energies
 from halfspace_sss.executors import completed
-from halfspace_sss.interface.model import BSSRDF, bssrdf, models
+from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.maps.grid import draw_media
 from halfspace_sss.maps.noisy_maps import LEAST_ALBEDO, CellGrid, Groups, make_pool, radial_edges
 from halfspace_sss.noise_free import NoiseFree
@@ -26,6 +26,7 @@ from halfspace_sss.physics.backbone import unwarp
 from halfspace_sss.physics.fresnel import F_t, mu_internal
 from halfspace_sss.physics.medium import Medium, eval_hg
 from halfspace_sss.progress import NamedProgress
+from halfspace_sss.registry import bssrdf, models
 
 if TYPE_CHECKING:
     import pandas

@@ -13,14 +13,15 @@ from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.comparison.curve_set import TRACED, Curve, CurveSet
 from halfspace_sss.comparison.model_truths import sampled_reflectance
-from halfspace_sss.interface.model import BSSRDF, bssrdf
-from halfspace_sss.interface.model import models as all_models
+from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.materials import Material
 from halfspace_sss.materials.registry import one_channel
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.fresnel import mu_internal
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import Progress
+from halfspace_sss.registry import bssrdf
+from halfspace_sss.registry import models as all_models
 from halfspace_sss.tracing.passes import launch_shape
 from halfspace_sss.tracing.tracer import Line, trace, trace_curve
 

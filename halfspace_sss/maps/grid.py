@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from halfspace_sss.arrays import library
+from halfspace_sss.neural.hypernetwork import RANGES
 from halfspace_sss.physics.backbone import length_scale, unwarp, warp
 from halfspace_sss.physics.medium import Medium
 
@@ -75,7 +76,6 @@ def map_directions(medium: Medium, grid: MapGrid, seed: int) -> tuple[np.ndarray
     return mu_i, lowest + (1 - lowest) * u[0], 2 * math.pi * u[1] - math.pi
 
 
-RANGES = {"albedo": (0.0, 1.0), "g": (-0.5, 0.98), "eta": (1.0, 2.0)}  # what the shipped weights were trained on
 LEAST_ABSORPTION = 1e-5  # 1 - albedo of the log-uniform half
 
 

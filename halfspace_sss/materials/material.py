@@ -11,8 +11,9 @@ from types import MappingProxyType
 
 import numpy as np
 
-from halfspace_sss.interface.model import BSSRDF, bssrdf, models
+from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.registry import bssrdf, models
 
 LONGEST_NAME = 80  # bytes in UTF-8; file systems end at 255
 

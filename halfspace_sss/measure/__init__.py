@@ -22,10 +22,11 @@ import numpy as np
 
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_cosine, check_count, rounding
-from halfspace_sss.interface.model import BSSRDF, bssrdf, models
+from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.fresnel import C_1, F_t, mu_external, mu_internal
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.registry import bssrdf, models
 
 if TYPE_CHECKING:
     import pandas

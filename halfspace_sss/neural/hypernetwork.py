@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from halfspace_sss.arrays import library
-from halfspace_sss.maps.grid import RANGES
 from halfspace_sss.neural.features import N_FEATURES, medium_features
 from halfspace_sss.neural.network import Network, layer_shapes
 from halfspace_sss.physics.backbone import length_scale
 from halfspace_sss.physics.medium import Medium
 
+RANGES = {"albedo": (0.0, 1.0), "g": (-0.5, 0.98), "eta": (1.0, 2.0)}  # what the shipped weights were trained on
 Layers = tuple[tuple[np.ndarray, np.ndarray], ...]  # matrix (inputs, outputs) and bias of each
 
 

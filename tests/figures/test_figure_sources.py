@@ -18,7 +18,7 @@ from figures.computing.contenders import long_walk
 from figures.parts.code import PACKAGES, modules_of
 from figures.parts.part import Task, unmodelled
 from full_geometry.transport.models import lookup
-from halfspace_sss.interface.model import model_class
+from halfspace_sss.registry import model_class
 
 ROOT = Path(figures.__file__).resolve().parent.parent
 

@@ -12,7 +12,7 @@ import torch
 import halfspace_sss
 from halfspace_sss import Medium
 from halfspace_sss.arrays import library
-from halfspace_sss.interface import model as interface
+from halfspace_sss.interface import gradient_blocks
 
 MEDIUM = Medium(1.8075, 0.6025, 0.0, 1.3)
 RGB = Medium([1.0, 2.0, 0.5], [0.1, 0.01, 0.2], 0.3, 1.4)
@@ -24,7 +24,7 @@ def gradients(queries, monkeypatch):
     """`gradients(model, n_bytes)`: S and its derivatives by all arguments, and into how many blocks they were split."""
 
     def of(model, n_bytes: int, n: int = N) -> tuple:
-        monkeypatch.setattr(interface, "BLOCK_BYTES", n_bytes)
+        monkeypatch.setattr(gradient_blocks, "BLOCK_BYTES", n_bytes)
         shaped = [v.reshape(3, -1) for v in queries(n, model.medium)]
         args = [torch.from_numpy(v).requires_grad_() for v in shaped]
         S = model.eval(*args)
@@ -38,7 +38,7 @@ def gradients(queries, monkeypatch):
 @pytest.mark.slow
 def test_values_and_derivatives_of_blocks_are_those_of_the_whole(name, gradients):
     model = halfspace_sss.bssrdf(name, MEDIUM)
-    n = 5 * interface.PROBE + 28
+    n = 5 * gradient_blocks.PROBE + 28
     S, derivatives, _ = gradients(model, 1 << 40, n)
     in_blocks, by_blocks, joined = gradients(model, 1, n)
     assert len(joined.next_functions) == 6
@@ -67,14 +67,14 @@ def test_second_derivatives_go_through_blocks(monkeypatch):
     model = halfspace_sss.bssrdf("directional_dipole", MEDIUM)
     r, second = torch.linspace(0.1, 3, 400, dtype=torch.float64, requires_grad=True), []
     for n_bytes in (1 << 40, 1):
-        monkeypatch.setattr(interface, "BLOCK_BYTES", n_bytes)
+        monkeypatch.setattr(gradient_blocks, "BLOCK_BYTES", n_bytes)
         first = torch.autograd.grad(model.eval(r, 0.8, 0.2, 0.7, 0.4).sum(), r, create_graph=True)[0]
         second.append(torch.autograd.grad(first.sum(), r)[0])
     assert torch.equal(*second) and second[0].abs().min() > 0
 
 
 def test_transforms_of_functions_and_forward_derivatives_are_answered_at_once(monkeypatch):
-    monkeypatch.setattr(interface, "BLOCK_BYTES", 1)
+    monkeypatch.setattr(gradient_blocks, "BLOCK_BYTES", 1)
     model = halfspace_sss.bssrdf("directional_dipole", MEDIUM)
     r = torch.linspace(0.1, 3, 400, dtype=torch.float64, requires_grad=True)
 
@@ -90,10 +90,10 @@ def test_transforms_of_functions_and_forward_derivatives_are_answered_at_once(mo
 
 
 def test_what_depends_on_further_tensors_keeps_their_derivatives(monkeypatch):
-    monkeypatch.setattr(interface, "BLOCK_BYTES", 1)
+    monkeypatch.setattr(gradient_blocks, "BLOCK_BYTES", 1)
     strength = torch.tensor(2.0, requires_grad=True)
     r = torch.linspace(0.1, 3, 400, requires_grad=True)
-    value = interface.recorded_in_blocks(library(r), lambda r: strength * r * r, (r,))
+    value = gradient_blocks.recorded_in_blocks(library(r), lambda r: strength * r * r, (r,))
     value.sum().backward()
     assert strength.grad == pytest.approx(float((r.detach() ** 2).sum()), rel=1e-6)
 

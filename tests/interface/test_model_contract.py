@@ -12,9 +12,8 @@ from scipy.stats import chisquare
 
 import halfspace_sss
 from analytic_models.standard_dipole import StandardDipole
-from halfspace_sss import Medium
+from halfspace_sss import Medium, registry
 from halfspace_sss.backend import array_types
-from halfspace_sss.interface import model as interface
 
 MEDIA = [
     Medium(1.8075, 0.6025, 0.0, 1.3),
@@ -240,7 +239,7 @@ DEFINE = "class Twice(StandardDipole):\n    name = 'twice'\n    version = {}\n"
 @pytest.fixture
 def define(monkeypatch):
     """`define(version, **scope)`: the class of a cell of a notebook, in a registry of its own."""
-    monkeypatch.setattr(interface, "_registered", {})
+    monkeypatch.setattr(registry, "_registered", {})
 
     def run(version: int, **scope: str) -> type:
         names = {"StandardDipole": StandardDipole, "__name__": "__main__", **scope}

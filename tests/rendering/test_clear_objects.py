@@ -14,7 +14,7 @@ mi = pytest.importorskip("mitsuba")
 
 from full_geometry.geometry.shape import analyse_shape  # noqa: E402
 from full_geometry.transport.half_space import MOST_STRAIGHT, straight_share  # noqa: E402
-from halfspace_sss.interface.model import models  # noqa: E402
+from halfspace_sss.registry import models  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

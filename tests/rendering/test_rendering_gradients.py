@@ -42,7 +42,7 @@ def _by_the_medium(scene, names: tuple[str, ...]) -> dict[str, np.ndarray]:
 def test_derivatives_by_the_medium_agree_with_finite_differences_for_every_model(name):
     if name == "neural_paper":
         pytest.skip("trained for one medium; the same scaling law as neural_material, and a kernel of a minute")
-    model = halfspace_sss.interface.model.bssrdf(name, Medium(**MEDIUM))
+    model = halfspace_sss.registry.bssrdf(name, Medium(**MEDIUM))
     scene = make("point", name, n=8, floor=False, orders="total" if model.orders == "total" else "multiple")
     for parameter, found in _by_the_medium(scene, ("sigma_t",) if name in UNTRAINED else COEFFICIENTS).items():
         expected, size = medium_difference(scene, parameter)

@@ -22,10 +22,18 @@ from torch import nn
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.comparison.model_truths import exits
-from halfspace_sss.maps.grid import RANGES, draw_media
+from halfspace_sss.maps.grid import draw_media
 from halfspace_sss.maps.noisy_maps import CellGrid, draw_directions, load_maps, looking_back, make_pool
 from halfspace_sss.neural.features import N_MEDIUM, medium_features
-from halfspace_sss.neural.hypernetwork import CALIBRATION, N_TERMS, Hypernetwork, Layers, chebyshev, named_layers
+from halfspace_sss.neural.hypernetwork import (
+    CALIBRATION,
+    N_TERMS,
+    RANGES,
+    Hypernetwork,
+    Layers,
+    chebyshev,
+    named_layers,
+)
 from halfspace_sss.neural.store import save_weights
 from halfspace_sss.neural.training.fit import Fit, fit
 from halfspace_sss.neural.training.learners import Hyper

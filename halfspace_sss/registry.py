@@ -1,0 +1,128 @@
+"""Half-space models by name.
+
+Those of `halfspace_sss.neural` are listed there. All others join by entry points of the group `halfspace_sss.models`,
+each a list of classes, `analytic_models` too: it stands above this package, which cannot import it. A list is taken as
+a whole, or left out with a warning.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+from halfspace_sss.checks import did_you_mean
+from halfspace_sss.extensions import FAILURES, MODELS, offered, warn_left_out
+from halfspace_sss.interface.model import BSSRDF
+from halfspace_sss.lazy import once
+from halfspace_sss.neural import MODELS as NEURAL
+from halfspace_sss.physics.layers import Layers
+from halfspace_sss.physics.medium import Medium, medium_of
+
+_registered: dict[str, type[BSSRDF]] = {}
+
+
+@once
+def _installed() -> Mapping[str, type[BSSRDF]]:
+    """Models of `neural`, and of all installed packages."""
+    return listed_models(BSSRDF)
+
+
+def register_model(cls: type[BSSRDF]) -> type[BSSRDF]:
+    """Add a model class under its `name`; usable as a decorator.
+
+    A class of the same module and qualified name as one that was registered before, as from a cell of a notebook that
+    runs again, takes its place.
+
+    Raises:
+        ValueError: it is not a BSSRDF with name and orders, or the name is taken by another class.
+    """
+    check_model_class(cls, BSSRDF)
+    if cls.name in models() and not _defined_again(cls):
+        raise ValueError(f"model name must be new, got {cls.name!r}, which is registered already")
+    _registered[cls.name] = cls
+    return cls
+
+
+def _defined_again(cls: type[BSSRDF]) -> bool:
+    before = _registered.get(cls.name)
+    return before is not None and (before.__module__, before.__qualname__) == (cls.__module__, cls.__qualname__)
+
+
+def models() -> tuple[str, ...]:
+    """Names of all models, in the order of their lists."""
+    return (*_installed(), *_registered)
+
+
+def bssrdf(name: str, medium: Medium) -> BSSRDF:
+    """The model called `name` for a medium, or for that of a material.
+
+    Raises:
+        ValueError: no such model (the nearest name is given), or the model refuses the medium, as all refuse `Layers`.
+    """
+    if isinstance(medium, Layers):
+        raise ValueError(f"medium must be one Medium for {name}, got Layers of {len(medium)}; `trace` takes those")
+    return model_class(name)(medium_of(medium))
+
+
+def model_class(name: str) -> type[BSSRDF]:
+    """The class of a model; ValueError with the nearest name if there is none."""
+    check_allowed(name)
+    known = {**_installed(), **_registered}
+    if name not in known:
+        hint = did_you_mean(name, list(known)) + "; `render` and `errors object` take models of objects"
+        raise ValueError(f"model must be one of {', '.join(known)}, got {name!r}{hint}")
+    return known[name]
+
+
+_closed_for: list[str] = []
+
+
+def check_model_class(cls: Any, base: type) -> None:
+    """ValueError if it is no class of a model, or has no usable name or orders."""
+    if not (isinstance(cls, type) and issubclass(cls, base)):
+        raise ValueError(f"a model must be a subclass of {base.__name__}, got {cls!r}")
+    name, orders = getattr(cls, "name", None), getattr(cls, "orders", None)
+    if not isinstance(name, str) or not name:
+        raise ValueError(f"name of a model must be a text that is not empty, got {name!r}")
+    if orders not in ("multiple", "total"):
+        raise ValueError(f"orders of a model must be multiple or total, got {orders!r}")
+
+
+@contextmanager
+def no_models(who: str) -> Iterator[None]:
+    """Within it, in every thread, asking for a model by its name is an error: `who` is known to need none."""
+    _closed_for.append(who)
+    try:
+        yield
+    finally:
+        _closed_for.pop()
+
+
+def check_allowed(name: str) -> None:
+    """RuntimeError within `no_models`."""
+    if _closed_for:
+        raise RuntimeError(f"{_closed_for[-1]} is declared to find no model by name, and asks for {name!r}")
+
+
+def listed_models(base: type) -> dict[str, type]:
+    """The model classes of all lists by name: of `analytic_models`, of `neural`, of other packages."""
+    results: dict[str, type] = {}
+    for name, classes in (*offered(MODELS, own=True), ("neural", NEURAL), *offered(MODELS)):
+        try:
+            results |= _new_models(classes, base, results)
+        except FAILURES as error:
+            warn_left_out(MODELS, name, error)
+    return results
+
+
+def _new_models(classes: Any, base: type, known: Mapping[str, type]) -> dict[str, type]:
+    new: dict[str, type] = {}
+    for cls in classes:
+        check_model_class(cls, base)
+        if known.get(cls.name) is cls:  # from a list that is offered twice
+            continue
+        if cls.name in known or cls.name in new:
+            raise ValueError(f"model name must be new, got {cls.name!r}, which is registered already")
+        new[cls.name] = cls
+    return new
