@@ -222,7 +222,7 @@ class MaterialFit:
 
 
 class ViewMisfit(NamedTuple):
-    """What two renders of a view say.
+    """The comparison of two renders of a view with its image.
 
     Args:
         loss, variance: of the view, and its variance by noise.
@@ -288,10 +288,12 @@ class ViewComparison:
         return int(np.random.SeedSequence(words).generate_state(1)[0])
 
     def view(self, which: int, k: int, pair: Sequence[np.ndarray] = ()) -> ViewMisfit:
-        """A view in a step; one that is held out at the exposure that suits it.
+        """Compare a view with its image in step k; a view that is held out takes the exposure that suits it best.
 
         Args:
-            pair: its two renders, if they are there.
+            which: number of the view.
+            k: number of the step, which seeds the renders.
+            pair: two renders of the view, if there are any; by default they are made.
         """
         view = self.views[which]
         purposes = ("test", "other test") if view.held_out else ("first", "second")
@@ -306,11 +308,12 @@ class ViewComparison:
         return misfit
 
     def _weights(self, which: int, k: int) -> tuple[np.ndarray, np.ndarray | float]:
-        """Of pixels and channels of a view in a step, 0 where they do not count; and 1 / (I'' - T) where it bends."""
+        """Weights w of pixels and channels in step k, 0 where they do not count; and 1 / (I'' - T) at bends."""
         view, e = self.views[which], self.exposures[which]
         counts = np.broadcast_to(view.counts[..., None], view.image.shape).astype(float)
         if self.settings.loss == "l2" or not view.counts.any():
             return counts, 0.0
+        # Weigh by 1 / (B + floor)², B from renders that are compared with nothing: T and its noise stay out of it.
         if which not in self.shown:
             seeds = [self.seed(k, which, "weights", number) for number in range(FIRST)]
             self.shown[which] = np.mean([self.image(view, seed) for seed in seeds], axis=0)
@@ -319,20 +322,26 @@ class ViewComparison:
         weights = counts / np.square(scale)
         if self.settings.loss != "robust":
             return weights, 0.0
+        # Bend the loss of Huber by a third render: weights fall as 1 / |r| beyond BEND.
         off = e * self.image(view, self.seed(k, which, "weights", FIRST)) - view.image
         factor = 1 / np.maximum(np.abs(off) / scale / BEND, 1)
         bent = np.divide(1.0, off, out=np.zeros_like(off), where=factor < 1)
         return weights * factor / factor[view.counts].mean(), bent
 
-    def _misfit(self, which: int, pair: Sequence[np.ndarray], w: np.ndarray, bent: Any) -> ViewMisfit:
+    def _misfit(self, which: int, pair: Sequence[np.ndarray], w: np.ndarray, bent: np.ndarray | float) -> ViewMisfit:
         e, T, n = self.exposures[which], self.views[which].image, self.count(which)
+        # Compare both renders with the image: the product of independent residuals a b has no bias by noise.
         a, b = (e * image - T for image in pair)
         noise = np.square(a - b) / 2  # variance of each
         variance = float((np.square(w) * (noise * (np.square(a) + np.square(b)) / 2)).sum()) / n**2
         loss, residual = float((w * a * b).sum() / n), (a + b) / 2
-        slope = loss + float((w * T * residual).sum() / n)  # mean w (a + T) b, of independent samples
+        # Derive the loss by ln e: d(e I)/d ln e = a + T, so that the slope is mean w (a + T) b.
+        slope = loss + float((w * T * residual).sum() / n)
         curvature = float((w * (a + T) * (b + T)).sum() / n)
-        return ViewMisfit(loss, variance, residual, noise / 2, w, w * (1 - residual * bent), slope, curvature)
+        return ViewMisfit(
+            loss=loss, variance=variance, residual=residual, noise=noise / 2, weights=w,
+            stiffness=w * (1 - residual * bent), exposure_slope=slope, exposure_curvature=curvature,
+        )  # fmt: skip
 
     def ends(self, k: int) -> tuple[NoiseFree, NoiseFree | None, list[FittedView]]:
         """The root of the loss of all fitted views, and likewise of views held out (None without any); all views."""

@@ -126,7 +126,10 @@ class ViewMeans:
     def none(cls, pixels: int, variables: int) -> ViewMeans:
         """Before the first step."""
         image, x, J = np.zeros(pixels), np.zeros(variables), np.zeros((pixels, variables))
-        return cls(image, image, image, image, x, 0.0, J, np.zeros((2, variables)))
+        return cls(
+            weights=image, stiffness=image, image=image, variance=image, x=x, renders=0.0, J=J,
+            own=np.zeros((2, variables)),
+        )  # fmt: skip
 
     def forget(self, x: np.ndarray) -> None:
         """Count less for what is far from x."""
@@ -281,8 +284,8 @@ class MediumDescent:
         told = off + self.parameters.at_bounds(x) + _ambiguity(values, correlation)
         medium, exposures = surface_of(self.parameters.shape).spec.medium, self.comparison.exposures.tolist()
         return MaterialFit(
-            values, errors, correlation, medium, fitted, test, chi_square, exposures, bool(off), told,
-            self.steps, views,
+            values=values, errors=errors, correlation=correlation, medium=medium, misfit=fitted, held_out=test,
+            chi_square=chi_square, exposures=exposures, is_misfit=bool(off), told=told, steps=self.steps, views=views,
         )  # fmt: skip
 
     def _residual(self, which: int) -> tuple[np.ndarray, np.ndarray]:

@@ -67,7 +67,7 @@ DRAWS = 16  # of noise, for standard errors
 
 @dataclass(frozen=True, eq=False)
 class Variable:
-    """A texture or a constant, in variables without bounds.
+    """A texture or a constant that is fitted, in variables without bounds.
 
     Args:
         name: of the parameter.
@@ -192,7 +192,7 @@ class Variable:
         parameters = mi.traverse(self.texture)
         kept, (rows, columns, channels) = parameters["data"], self.start.shape
         most = max(rows, columns)  # numbers are shown over that, as colours are at most 1
-        ways = [np.where((np.arange(n) == n - 1) & (n % 2 == 1), 2, np.arange(n) % 2) for n in (rows, columns)]
+        kinds = [np.where((np.arange(n) == n - 1) & (n % 2 == 1), 2, np.arange(n) % 2) for n in (rows, columns)]
         numbers, weights = [], []
 
         def seen(values: np.ndarray) -> np.ndarray:
@@ -201,9 +201,11 @@ class Variable:
             parameters.update()
             return np.array(self.texture.eval(si)[0], dtype=float) + np.zeros(dr.width(si))
 
-        for a in np.unique(ways[0]):
-            for b in np.unique(ways[1]):
-                own = ((ways[0] == a)[:, None] & (ways[1] == b)).astype(float)
+        # Let the bitmap show texels of one kind of row and column alone, so that a point sees one of them at most:
+        # the indicator of the kind is its weight, and row (or column) times indicator over the weight its number.
+        for a in np.unique(kinds[0]):
+            for b in np.unique(kinds[1]):
+                own = ((kinds[0] == a)[:, None] & (kinds[1] == b)).astype(float)
                 w = seen(own)
                 at = [
                     np.rint(np.divide(most * seen(own * k / most), w, out=np.zeros_like(w), where=w > 1e-4)).astype(int)
@@ -284,7 +286,10 @@ def _variable(
         texels = np.arange(numbers[..., 0].size).reshape(numbers.shape[:2])
         beside = ((texels[1:], texels[:-1]), (texels[:, 1:], texels[:, :-1]))
         pairs = np.concatenate([np.stack([a.ravel(), b.ravel()], axis=1) for a, b in beside])
-    return Variable(name, key, type(parameters[key]), numbers, bounds, texture, factor * unit, unit, pairs)
+    return Variable(
+        name=name, key=key, kind=type(parameters[key]), start=numbers, bounds=bounds, texture=texture,
+        factor=factor * unit, unit=unit, pairs=pairs,
+    )  # fmt: skip
 
 
 def _bounds(
@@ -336,10 +341,12 @@ class PixelMeans:
     def none(cls, pixels: int, variables: int) -> PixelMeans:
         """Before the first step."""
         one, many = np.zeros(pixels), np.zeros((variables, pixels))
-        return cls(one, one, one, one, many, many, one, one)
+        return cls(
+            weights=one, stiffness=one, image=one, variance=one, slopes=many, shown=many, renders=one, sloped=one
+        )
 
     def forget(self, shown: np.ndarray, by_x: np.ndarray) -> None:
-        """Count less for what is far from what is shown now, in variables by derivatives of the numbers."""
+        """Weigh earlier renders by how far their texels were, in variables: |D v - mean D v| / (D dv/dx)."""
         far = np.abs(shown - self.shown) / np.maximum(by_x, 1e-30)
         kept = kept_at(far.max(axis=0))
         self.renders, self.sloped = kept * self.renders, kept * self.sloped
@@ -422,12 +429,14 @@ class TextureDescent:
         means = {
             v.name: each.reshape(-1, each.shape[-1]).mean(axis=0) for v, each in zip(self.variables, self._shown())
         }
+        # Render each view of the step twice, which gives its loss and renews its means.
         for which in (views := compared.batch(k)):
             misfit = self._measure(which, k)
             if compared.settings.exposure:
                 compared.expose(which, -EXPOSURE_MEMORY * misfit.exposure_slope / misfit.exposure_curvature)
             losses.append(misfit.loss)
             variance += misfit.variance / len(views) ** 2
+        # Move to the least of the quadratic model, H dx = -g, by LONGEST at most.
         H, g = self._normal()
         move = np.clip(H.solved(-g), -LONGEST, LONGEST)
         moved = np.split(self.x + move, self.ends)
@@ -440,11 +449,14 @@ class TextureDescent:
         compared, view = self.comparison, self.comparison.views[which]
         shown = self._at_pixels(which)
         means = self.means.setdefault(which, PixelMeans.none(view.image.size, len(self.variables)))
+        # Forget what was measured at other texels: D v has moved by |D v - mean D v| / D v' in the variables.
         if k < SETTLING * self.total:
             means.forget(shown, self._at_pixels(which, by_x=True))
+        # Render twice with independent samples; models take their slopes of the second render at the start alone.
         both = compared.at_once or not means.sloped.any()
         renders = [self._render(which, k, "first", True), self._render(which, k, "second", both)]
         misfit = compared.view(which, k, [image for image, _ in renders])
+        # Add both to the means; the variance of I is that of e I over e², twice that of the mean of the pair.
         w, stiffness = (v.ravel() / compared.count(which) for v in (misfit.weights, misfit.stiffness))
         noise = 2 * misfit.noise.ravel() / compared.exposures[which] ** 2
         for image, slopes in renders:
@@ -460,6 +472,7 @@ class TextureDescent:
         for v, x in zip(self.variables, self._parts()):
             self.scene_parameters[v.key] = v.numbers(x) if v.is_texture else followed[v.name]
         self.scene_parameters.update()
+        # Differentiate by an even change of each texture, which the surface adds to what its texels show.
         surface = surface_of(self.parameters.shape)
         textures = {FIELDS.get(v.name, v.name): followed[v.name] for v in self.variables if v.is_texture}
         surface.spec = surface.spec.with_variables(surface, **textures)
@@ -471,17 +484,19 @@ class TextureDescent:
 
     @functools.cached_property
     def _footprints(self) -> dict[tuple[int, int], csr_array]:
-        """D of views and variables, of all channels, shape (numbers of the image, numbers of the variable)."""
+        """D by (view, variable): shares of texels in pixels, shape (numbers of the image, numbers of the variable)."""
         result = {}
         for which in self.comparison.fitted:
             view = self.comparison.views[which]
             height, width, channels = view.image.shape
             at, si, corner = self._points(view.sensor)
             for j, v in enumerate(self.variables):
+                # Add the weights of texels up over the rays of a pixel, and scale each row of D to the sum 1.
                 texels, weights = v.places(self.parameters.shape, si, corner)
                 at_texels = np.tile(at, len(texels)), texels.ravel()
                 D = csr_array((weights.ravel(), at_texels), (height * width, v.texels))
                 D = diags_array(1 / np.maximum(D.sum(axis=1), 1e-30)) @ D
+                # Repeat D for each channel of the image: its own of a colour, the one of a grey texture.
                 spread = np.eye(channels) if v.start.shape[-1] == channels else np.ones((channels, 1))
                 result[which, j] = csr_array(kron(D, spread))
         return result
@@ -492,9 +507,11 @@ class TextureDescent:
         film, ray = sensor.film(), camera_rays(sensor, RAYS, (self.comparison.settings.seed, number))
         width, height = (int(n) for n in film.crop_size())
         met = scene.ray_intersect_preliminary(mi.Ray3f(ray[0]))
+        # Find the pixel of each ray; positions of a box filter lie on its lower edge, less rounding.
         column, row = (np.floor(np.array(p) + 1e-4).astype(int) - int(o) for p, o in zip(ray[2], film.crop_offset()))
         inside = (0 <= column) & (column < width) & (0 <= row) & (row < height)
         on = met.is_valid() & (met.shape == mi.ShapePtr(self.parameters.shape)) & mi.Bool(inside)
+        # Keep the rays that meet the object within the crop.
         kept = dr.compress(on)
         ray, met = (dr.gather(type(each), each, kept) for each in (mi.Ray3f(ray[0]), met))
         return (row * width + column)[np.array(kept)], met.compute_surface_interaction(ray), met.prim_uv
@@ -504,12 +521,12 @@ class TextureDescent:
         return np.split(self.x, self.ends)
 
     def _at_pixels(self, which: int, by_x: bool = False) -> np.ndarray:
-        """D of what each texture shows, or of its derivatives by x, shape (variables, pixels)."""
+        """D v of each variable at the pixels of a view, or D dv/dx, shape (variables, pixels)."""
         of = [(v.slope(x) if by_x else v.parameter(x)) / v.unit for v, x in zip(self.variables, self._parts())]
         return np.stack([self._footprints[which, j] @ each for j, each in enumerate(of)])
 
     def _jacobian(self, which: int) -> csr_array:
-        """Of the image of a view by x."""
+        """The Jacobian e s_p D_pt dv_t/dx_t of the image of a view by x, shape (pixels, variables)."""
         parts = [
             diags_array(s) @ self._footprints[which, j] @ diags_array(v.slope(x) / v.unit)
             for j, (s, v, x) in enumerate(zip(self.means[which].slopes, self.variables, self._parts()))
@@ -517,19 +534,21 @@ class TextureDescent:
         return csr_array(self.comparison.exposures[which] * hstack(parts))
 
     def _normal(self) -> tuple[Curvature, np.ndarray]:
-        """Of loss and total variation at x half the second derivative, and half the gradient."""
+        """H and g: half the second derivative and half the gradient of loss and total variation at x."""
+        # Stack the Jacobians, residuals and weights of all views that have been met, each view with the same weight.
         J = vstack([self._jacobian(which) for which in self.means])
         weights, off = [], []
         for which, means in self.means.items():
             off.append(self._residual(which) / len(self.means))
             weights.append(means.weights / len(self.means))
+        # Linearise the total variation about x: |d| is replaced by d² / |d at x|.
         smooth = [kron(v.smoothing(x), np.eye(v.start.shape[-1])) for v, x in zip(self.variables, self._parts())]
         L = 0.5 * self.comparison.settings.tv * csr_array(block_diag(smooth))
         H = Curvature(csr_array(J), np.concatenate(weights), L)
         return H, J.T @ np.concatenate(off) + L @ self.x
 
     def _residual(self, which: int) -> np.ndarray:
-        """What is left of a view by the means of its renders, times weights."""
+        """w (e I + e J (v - mean v) - T) of a view, by the means of its renders, shape (pixels,)."""
         means, e = self.means[which], self.comparison.exposures[which]
         moved = e * (means.slopes * (self._at_pixels(which) - means.shown)).sum(axis=0)
         return e * means.image + means.weights * (moved - self.comparison.views[which].image.ravel())
@@ -543,6 +562,7 @@ class TextureDescent:
         """Where the steps have ended."""
         self._put(self._followed())
         fitted, held, views = self.comparison.ends(self.total)
+        # Test residuals over the root of their weights, whose noise is alike in all pixels.
         residuals = [
             (self._residual(which) / np.sqrt(np.maximum(means.weights, 1e-30))).reshape(
                 self.comparison.views[which].image.shape
@@ -553,6 +573,7 @@ class TextureDescent:
         errors, told = self._errors(), chi_square.told()
         for v, x, error in zip(self.variables, self._parts(), errors):
             told += self._told(v, x, error)
+        # Part constants from textures.
         found = {v.name: (v.is_texture, *each) for v, *each in zip(self.variables, self._shown(), errors)}
         (values, errors), (textures, texture_errors) = (
             [{name: each[j] for name, each in found.items() if each[0] == kind} for j in (1, 2)]
@@ -562,15 +583,18 @@ class TextureDescent:
         medium = medium.textured.mean(medium.medium.g, medium.medium.eta, self.parameters.shape)
         exposures = self.comparison.exposures.tolist()
         return MaterialFit(
-            values, errors, np.zeros((0, 0)), medium, fitted, held, chi_square, exposures, chi_square.is_misfit, told,
-            self.steps, views, textures, texture_errors,
+            values=values, errors=errors, correlation=np.zeros((0, 0)), medium=medium, misfit=fitted, held_out=held,
+            chi_square=chi_square, exposures=exposures, is_misfit=chi_square.is_misfit, told=told, steps=self.steps,
+            views=views, textures=textures, texture_errors=texture_errors,
         )  # fmt: skip
 
     def _errors(self) -> list[np.ndarray]:
         """Standard errors by noise, in the shape of each variable; NaN where no view shows a texel."""
+        # Estimate the variance of a residual by the loss of the last steps, or by its spread where that is larger.
         last = np.array([step.loss for step in self.steps[int(SETTLING * self.total) :]])
         loss = max(float(last.mean()), float(last.std() / np.sqrt(len(last))))
         rng, H = np.random.default_rng([self.comparison.settings.seed, 7]), self._normal()[0]
+        # Let noise of images and of renders move the minimum: dx = H^-1 J^T (noise), DRAWS times.
         stiffness = np.concatenate([means.stiffness for means in self.means.values()]) / len(self.means)
         H = replace(H, weights=np.maximum(stiffness, 0))
         variance = np.concatenate([
