@@ -18,8 +18,9 @@ import numpy as np
 
 from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.trade.assessing import assess_stage
+from full_geometry.trade.job import Effort
 from full_geometry.trade.results import ObjectTrade
-from full_geometry.trade.ways import Stage, Way
+from full_geometry.trade.techniques import Stage, Technique
 from halfspace_sss.backend import clock
 from halfspace_sss.comparison.model_errors import model_error, references
 from halfspace_sss.neural.network import Network
@@ -49,8 +50,8 @@ def entry_settings(
     results = []
     for n in entries:
         stage = replace(on, bssrdf={**on.bssrdf, "entries": n}, paces={}, _integrators={})
-        chosen = [Way(PATH_TRACED), *map(Way, names)]
-        seen = assess_stage(stage, chosen, seconds=seconds, seed=seed).objects[0]
+        chosen = [Technique(PATH_TRACED), *map(Technique, names)]
+        seen = assess_stage(stage, chosen, Effort(seconds, seed=seed)).objects[0]
         results += [("entries", str(n), name, _cost(seen, name), seen.way(name).bias) for name in names]
     usual = {way: cost for _, value, way, cost, _ in results if value == str(entries[0])}
     return [Setting(knob, value, way, cost / usual[way], error) for knob, value, way, cost, error in results]
@@ -72,11 +73,11 @@ def channel_settings(on: Stage, alone: Sequence[Stage], seconds: float, seed: in
         seconds: of measuring, each.
         seed: of the samples.
     """
-    together = assess_stage(on, [Way(PATH_TRACED)], seconds=seconds, seed=seed).objects[0]
+    together = assess_stage(on, [Technique(PATH_TRACED)], Effort(seconds, seed=seed)).objects[0]
     n, least = len(together.radiance), 0.0
     variance = n * together.traced.variance * np.mean(together.radiance) ** 2
     for stage in alone:
-        one = assess_stage(stage, [Way(PATH_TRACED)], seconds=seconds, seed=seed).objects[0]
+        one = assess_stage(stage, [Technique(PATH_TRACED)], Effort(seconds, seed=seed)).objects[0]
         least += math.sqrt(one.traced.variance * one.traced.seconds) * one.radiance[0]
     ratio = least**2 / (variance * together.traced.seconds)
     knob = "channels in one walk"

@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from full_geometry.trade.assessing import assess_stage
-from full_geometry.trade.results import Assessment, ObjectTrade, WayTrade
+from full_geometry.trade.job import Effort
+from full_geometry.trade.results import Assessment, ObjectTrade, TechniqueTrade
 from full_geometry.trade.statistics import seeded
-from full_geometry.trade.ways import Stage, Way
+from full_geometry.trade.techniques import Stage, Technique
 from halfspace_sss.provenance import provenance, write_atomically
 
 FORMAT = "halfspace-sss trade truth 2"
@@ -26,7 +27,9 @@ STEADY = 0.15  # relative standard error of variances
 FIRST, LATER = 0.4, 0.6  # share of walks in the time of a batch
 
 
-def long_run(on: Stage, ways: Sequence[Way], tolerance: float, path: Path, seed: int, seconds: float) -> Assessment:
+def long_run(
+    on: Stage, ways: Sequence[Technique], tolerance: float, path: Path, seed: int, seconds: float
+) -> Assessment:
     """The mean of as many batches as it takes, at most `seconds`; those that the file holds are not run again."""
     how = {"format": FORMAT, "tolerance": tolerance, "seed": seed, "ways": [way.name for way in ways]}
     batches: list[dict[str, Any]] = []
@@ -41,7 +44,7 @@ def long_run(on: Stage, ways: Sequence[Way], tolerance: float, path: Path, seed:
             return result
         few = [way for way in ways if way.name in names or way.walks]
         traced = LATER if batches else FIRST
-        batch = assess_stage(on, few, seconds=min(BATCH, seconds), seed=seeded(seed, len(batches)), traced=traced)
+        batch = assess_stage(on, few, Effort(min(BATCH, seconds), seed=seeded(seed, len(batches)), traced=traced))
         batches.append(batch.record())
         write_atomically(path, json.dumps({**how, "batches": batches, "provenance": provenance(**how)}) + "\n")
 
@@ -67,7 +70,7 @@ def mean_of(batches: Sequence[Assessment]) -> Assessment:
     return Assessment(tuple(objects), *spent, batches[0].seed)
 
 
-def _mean(rows: Sequence[WayTrade]) -> WayTrade:
+def _mean(rows: Sequence[TechniqueTrade]) -> TechniqueTrade:
     n = len(rows)
 
     def mean(key: str) -> float:

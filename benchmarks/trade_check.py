@@ -10,12 +10,13 @@ from typing import Any
 from benchmarks.long_runs import long_run
 from benchmarks.random_scenes import RandomScene, write_scene
 from full_geometry.scenes.scene_files import PATH_TRACED
-from full_geometry.trade.advice import Job, advise
+from full_geometry.trade.advice import advise
 from full_geometry.trade.assessing import assess_for, learn
 from full_geometry.trade.automatic import picked
-from full_geometry.trade.results import Assessment, WayTrade
+from full_geometry.trade.job import Effort, Job
+from full_geometry.trade.results import Assessment, TechniqueTrade
 from full_geometry.trade.statistics import seeded
-from full_geometry.trade.ways import Stage, Way, stage
+from full_geometry.trade.techniques import Stage, Technique, stage
 from halfspace_sss.neural.store import weights_in
 from halfspace_sss.provenance import provenance, write_atomically
 
@@ -34,7 +35,7 @@ def check_scene(scene: RandomScene, folder: Path, seconds: float, truth_seconds:
     Its object is learnt before, which is a cost of the model that needs it.
     """
     file = write_scene(scene, folder)
-    on, ways = stage(file), [Way.of(name) for name in WAYS]
+    on, ways = stage(file), [Technique.of(name) for name in WAYS]
     with weights_in(folder / "weights"):
         if any(way.model == LEARNT for way in ways):
             learn(on, TRAIN_SECONDS)
@@ -44,7 +45,7 @@ def check_scene(scene: RandomScene, folder: Path, seconds: float, truth_seconds:
     return {"scene": scene.record(), "quick": quick, "long": long.record()}
 
 
-def _quick(scene: RandomScene, on: Stage, ways: list[Way], path: Path, seconds: float) -> dict[str, Any]:
+def _quick(scene: RandomScene, on: Stage, ways: list[Technique], path: Path, seconds: float) -> dict[str, Any]:
     """The assessment as users make it, on which the recommendation rests."""
     how = {"format": FORMAT, "scene": scene.record(), "seconds": seconds, "ways": [way.name for way in ways]}
     if path.is_file():
@@ -52,7 +53,7 @@ def _quick(scene: RandomScene, on: Stage, ways: list[Way], path: Path, seconds: 
         if json.loads(json.dumps(how)).items() <= record.items():
             return record["quick"]
     number = seeded(scene.seed, scene.number, 0)
-    result = assess_for(on, ways, scene.tolerance, images=scene.images, seconds=seconds, seed=number).record()
+    result = assess_for(on, ways, Job(scene.tolerance, scene.images), Effort(seconds, seed=number)).record()
     record = {**how, "quick": result, "provenance": provenance(**how)}
     write_atomically(path, json.dumps(record, indent=1) + "\n")
     return result
@@ -91,7 +92,7 @@ def outcome(record: dict[str, Any]) -> dict[str, Any]:
     )
 
 
-def _least(row: WayTrade, scene: RandomScene, pixels: float) -> float:
+def _least(row: TechniqueTrade, scene: RandomScene, pixels: float) -> float:
     """Seconds of a job by a way if bias and variance were known, training and preparation included."""
     left = scene.tolerance**2 - max(row.bias2, 0.0)
     if not left > 0:

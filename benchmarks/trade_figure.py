@@ -21,7 +21,7 @@ from figures.modelling.closed_shapes import write_shape
 from figures.parts.part import Part, Result, Task
 from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.trade.results import Assessment
-from full_geometry.trade.ways import GATHERED, LAMBERT, Way
+from full_geometry.trade.techniques import GATHERED, LAMBERT, Technique
 from halfspace_sss import materials
 from halfspace_sss.comparison.style import paper, saved
 from halfspace_sss.physics.medium import Medium
@@ -90,19 +90,20 @@ def measured(task: Task) -> dict[str, Any]:
     """The assessment of a scene, and an image by each way."""
     from full_geometry.trade.assessing import assess_stage
     from full_geometry.trade.images import small_images, with_flip
-    from full_geometry.trade.ways import stage
+    from full_geometry.trade.job import Effort
+    from full_geometry.trade.techniques import stage
 
     prepare()
     p, learnt = task.params, with_weights(task.folder, task.needed)
     with TemporaryDirectory() as folder, learnt, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # they are in the notes of the assessment
         on = stage(_scene(p, Path(folder)))
-        chosen = [Way.of(name) for name in p["ways"]]
+        chosen = [Technique.of(name) for name in p["ways"]]
 
         def tell(what: str, done: int, total: int) -> None:
             task.progress(done, total + 1)
 
-        result = assess_stage(on, chosen, seconds=p["seconds"], seed=p["seed"], progress=tell)
+        result = assess_stage(on, chosen, Effort(p["seconds"], seed=p["seed"]), tell)
         named = {row.way for row in result.objects[0].ways if not row.refusal}
         shown = [way for way in chosen if way.name in named]
         images = small_images(on, shown, 0, p["seed"], p["size"], p["spp"])
@@ -114,7 +115,7 @@ def measured(task: Task) -> dict[str, Any]:
 def turned(task: Task) -> dict[str, Any]:
     """What the knobs bring on a scene."""
     from benchmarks.knobs import channel_settings, entry_settings, node_settings, precision_settings
-    from full_geometry.trade.ways import stage
+    from full_geometry.trade.techniques import stage
     from halfspace_sss.neural.symmetric import channels
 
     prepare()

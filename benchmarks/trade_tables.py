@@ -9,8 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from figures.drawing.trade_plot import LEAST, NOISE, pareto, span_in_mfp, time_to_noise
-from full_geometry.trade.advice import Job, advise
-from full_geometry.trade.results import Assessment, ObjectTrade, WayTrade
+from full_geometry.trade.advice import advise
+from full_geometry.trade.job import Job
+from full_geometry.trade.results import Assessment, ObjectTrade, TechniqueTrade
 from halfspace_sss.comparison.style import TEXT
 from halfspace_sss.noise_free import short
 
@@ -142,7 +143,7 @@ def _job(tolerance: float, images: int) -> str:
     return f"{100 * tolerance:g} %" + (f", {images} images" if images > 1 else "")
 
 
-def _grid(scenes: Scenes, cell: Callable[[WayTrade, ObjectTrade], str]) -> list[str]:
+def _grid(scenes: Scenes, cell: Callable[[TechniqueTrade, ObjectTrade], str]) -> list[str]:
     """A row for each way, a column for each scene of a material, a table for each material."""
     lines: list[str] = []
     for material in dict.fromkeys(key[0] for key in scenes):

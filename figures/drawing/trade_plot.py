@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from figures.computing.images import Shot, compared
 from figures.drawing.page import page
 from full_geometry.trade.images import TradePicture
-from full_geometry.trade.results import Assessment, ObjectTrade, WayTrade
-from full_geometry.trade.ways import GATHERED, NO_SINGLE
+from full_geometry.trade.results import Assessment, ObjectTrade, TechniqueTrade
+from full_geometry.trade.techniques import GATHERED, NO_SINGLE
 from halfspace_sss.comparison.style import TEXT, TRACED, Look, look, paper, saved
 
 NOISE = 0.01  # of the mean radiance, to which times are
@@ -67,13 +67,13 @@ def _look(way: str) -> Look:
     return style._replace(label=", ".join([style.label, *words]))
 
 
-def time_to_noise(row: WayTrade, pixels: float) -> float:
+def time_to_noise(row: TechniqueTrade, pixels: float) -> float:
     """Seconds after which an image has the noise `NOISE`."""
     return row.time_to(NOISE) * pixels
 
 
 def pareto(
-    ax: Axes, rows: Sequence[WayTrade], pixels: float, tolerance: float, small: bool = False
+    ax: Axes, rows: Sequence[TechniqueTrade], pixels: float, tolerance: float, small: bool = False
 ) -> dict[str, object]:
     """Bias over the time to a given noise; the front of what nothing beats in both."""
     handles: dict[str, object] = {}
@@ -106,7 +106,7 @@ def pareto(
     return handles
 
 
-def _interval(row: WayTrade) -> tuple[float, float]:
+def _interval(row: TechniqueTrade) -> tuple[float, float]:
     """Bias within one standard error of its square."""
     low, high = row.bias2 - row.bias2_error, row.bias2 + row.bias2_error
     return math.sqrt(max(low, 0.0)), math.sqrt(max(high, 0.0))
@@ -123,7 +123,7 @@ def _front(ax: Axes, points: list[tuple[float, float]]) -> None:
     ax.step([*xs, 1e3 * xs[-1]], [*ys, ys[-1]], where="post", color="0.8", lw=2.5, zorder=1, scalex=False)
 
 
-def _overtime_to_noise(ax: Axes, rows: Sequence[WayTrade], pixels: float, tolerance: float) -> None:
+def _overtime_to_noise(ax: Axes, rows: Sequence[TechniqueTrade], pixels: float, tolerance: float) -> None:
     """Total error over time, and where path tracing overtakes."""
     traced = next(w for w in rows if w.way == TRACED)
     middle = traced.variance * traced.seconds * pixels / tolerance**2
@@ -178,5 +178,5 @@ def _page(picture: TradePicture) -> str:
     return page(picture.title, {picture.title: shots}, exposure=_exposure(picture.images[TRACED]), caption=caption)
 
 
-def _numbers(row: WayTrade) -> dict[str, float | str]:
+def _numbers(row: TechniqueTrade) -> dict[str, float | str]:
     return {"bias, %": row.told_bias, "variance": f"{row.variance:.3g}", "s a million": f"{1e6 * row.seconds:.3g}"}

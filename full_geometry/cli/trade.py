@@ -15,7 +15,7 @@ from halfspace_sss.cli import shared
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from full_geometry.trade.results import ObjectTrade, WayTrade
+    from full_geometry.trade.results import ObjectTrade, TechniqueTrade
 
 SHIPPED = "trade.csv"  # in the package: three materials, two shapes, two lights
 HEADINGS = ("way", "bias, %", "variance", "s a million", "cost")
@@ -124,17 +124,18 @@ def _material(name: str, how: dict[str, Any], out: Path) -> None:
 def _scene(
     file: Path, wanted: TradeOptions, every: bool, how: dict[str, Any], out: Path, drawers: Drawers | None
 ) -> None:
-    from full_geometry.trade.advice import Job, advise
+    from full_geometry.trade.advice import advise
     from full_geometry.trade.assessing import assess
     from full_geometry.trade.images import picture_of
-    from full_geometry.trade.ways import ways
+    from full_geometry.trade.job import Job
+    from full_geometry.trade.techniques import techniques
     from halfspace_sss.provenance import provenance, write_together
 
     job, limits = Job(**asdict(wanted)), {"tolerance": wanted.tolerance, "images": wanted.images}
     if every and how["models"] is None:
-        how["models"] = [way.name for way in ways()]
+        how["models"] = [way.name for way in techniques()]
     with shared.Bar("trade") as bar:
-        result = assess(file, **how, **limits, progress=bar.told)
+        result = assess(file, **how, job=job, progress=bar.told)
     advice = advise(result, job)
     sentences = str(advice).splitlines()
     about = {"provenance": provenance(scene=str(file), **limits, **how), "integrator": advice.integrator}
@@ -162,7 +163,7 @@ def object_table(assessed: ObjectTrade) -> Table:
     return shared.table([*HEADINGS, "mean / traced", "preparation, s", "memory, MB", "FLIP"], rows, title=title)
 
 
-def _row(row: WayTrade) -> list[str]:
+def _row(row: TechniqueTrade) -> list[str]:
     cost = (f"{row.variance:.3g}", f"{1e6 * row.seconds:.3g}", f"{1e6 * row.seconds * row.variance:.3g}")
     means = " ".join(f"{value:.3f}" for value in row.ratio)
     flip = "–" if row.flip is None else f"{row.flip:.3f}"

@@ -14,16 +14,16 @@ if TYPE_CHECKING:
     from full_geometry.trade.advice import recommend
     from full_geometry.trade.assessing import assess
     from full_geometry.trade.flat import recommend_flat
-    from full_geometry.trade.results import Assessment, ObjectTrade, WayTrade
+    from full_geometry.trade.results import Assessment, ObjectTrade, TechniqueTrade
 
-__all__ = ["Assessment", "ObjectTrade", "WayTrade", "assess", "recommend", "recommend_flat"]
+__all__ = ["Assessment", "ObjectTrade", "TechniqueTrade", "assess", "recommend", "recommend_flat"]
 
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
         "Assessment": "results",
         "ObjectTrade": "results",
-        "WayTrade": "results",
+        "TechniqueTrade": "results",
         "assess": "assessing",
         "recommend": "advice",
         "recommend_flat": "flat",

@@ -18,37 +18,14 @@ from typing import Any
 
 from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.trade.assessing import assess
-from full_geometry.trade.results import UNNAMED, Assessment, ObjectTrade, WayTrade, html_table, samples_for
-from full_geometry.trade.ways import GATHERED, LAMBERT, Way
-from halfspace_sss.checks import check_count, check_interval
+from full_geometry.trade.job import Job
+from full_geometry.trade.results import UNNAMED, Assessment, ObjectTrade, TechniqueTrade, html_table, samples_for
+from full_geometry.trade.techniques import GATHERED, LAMBERT, Technique
 from halfspace_sss.noise_free import short
 from halfspace_sss.physics.medium import Medium
 
 INTEGRATOR = "bssrdf"
 DARK = "no light comes from it, every way shows it black"
-
-
-@dataclass(frozen=True)
-class Job:
-    """What is to be rendered.
-
-    Args:
-        tolerance: relative error of radiance, bias and noise together.
-        images: of the object, each as large as the film.
-        seconds: that all of them may take; None for no limit.
-        count_training: whether the time of a training that has been done counts too.
-    """
-
-    tolerance: float = 0.05
-    images: int = 1
-    seconds: float | None = None
-    count_training: bool = True
-
-    def __post_init__(self) -> None:
-        check_interval("tolerance", self.tolerance, 1e-4, 10.0)
-        check_count("images", self.images, 1)
-        if self.seconds is not None:
-            check_interval("seconds", self.seconds, 1e-3, 1e9)
 
 
 @dataclass(frozen=True)
@@ -154,8 +131,7 @@ def recommend(
         return advise(scene, job)
     if "assess_seconds" in assessing:
         assessing["seconds"] = assessing.pop("assess_seconds")
-    how = {"flip": False, "tolerance": tolerance, "images": images, "count_training": count_training, **assessing}
-    return advise(assess(scene, seed=seed, **how), job)
+    return advise(assess(scene, job=job, seed=seed, **{"flip": False, **assessing}), job)
 
 
 def advise(assessment: Assessment, job: Job) -> Advice:
@@ -199,14 +175,14 @@ def _object(assessed: ObjectTrade, job: Job) -> ObjectAdvice:
     return ObjectAdvice(assessed.object, best[3].way, (*told, *refused))
 
 
-_Raw = tuple[float, float, float, WayTrade]  # seconds, samples of a pixel, error, the way
+_Raw = tuple[float, float, float, TechniqueTrade]  # seconds, samples of a pixel, error, the way
 
 
-def _once(row: WayTrade, job: Job) -> float:
+def _once(row: TechniqueTrade, job: Job) -> float:
     return row.preparation + (row.training if job.count_training else 0.0)
 
 
-def _option(assessed: ObjectTrade, row: WayTrade, job: Job) -> _Raw:
+def _option(assessed: ObjectTrade, row: TechniqueTrade, job: Job) -> _Raw:
     needed = samples_for(row, job.tolerance)
     if not needed < math.inf:
         return math.inf, 0.0, row.bias, row
@@ -215,7 +191,7 @@ def _option(assessed: ObjectTrade, row: WayTrade, job: Job) -> _Raw:
     return took, spp, math.hypot(row.bias, math.sqrt(row.variance / spp)), row
 
 
-def _in_time(assessed: ObjectTrade, row: WayTrade, job: Job) -> _Raw:
+def _in_time(assessed: ObjectTrade, row: TechniqueTrade, job: Job) -> _Raw:
     """What a way comes to in the time that is allowed."""
     left = (job.seconds or math.inf) - _once(row, job)
     spp = math.floor(left / (job.images * assessed.pixels * row.seconds)) if left > 0 else 0
@@ -231,7 +207,7 @@ def _told(assessed: ObjectTrade, option: _Raw, best: _Raw, job: Job) -> Option:
         images = "an image" if job.images == 1 else f"{job.images} images"
         why = f"{row.way} is the cheapest that keeps {job.tolerance:.3g} ({size}): {off}, {images} in {_time(took)}"
         why += f" with {int(spp)} samples a pixel" + _training(row, job)
-        why += f"; render {Way.of(row.way).flags} --spp {int(spp)}"
+        why += f"; render {Technique.of(row.way).flags} --spp {int(spp)}"
     elif took < math.inf:
         over = job.seconds is not None and took > job.seconds
         why = f"{row.way} takes {_time(took)}"
@@ -255,13 +231,13 @@ def _nearest(option: _Raw, best: _Raw, job: Job) -> Option:
     return Option(row.way, took, int(spp), error, why)
 
 
-def _training(row: WayTrade, job: Job) -> str:
+def _training(row: TechniqueTrade, job: Job) -> str:
     if not row.training:
         return ""
     return f", its training of {_time(row.training)} {'counted' if job.count_training else 'left out'}"
 
 
-def _off(row: WayTrade) -> str:
+def _off(row: TechniqueTrade) -> str:
     """What is known of a bias, in words."""
     return "exact" if row.is_exact else f"{row.told_bias} % off"
 

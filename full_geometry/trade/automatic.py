@@ -23,8 +23,9 @@ from full_geometry.objects.objects import refuse_instances, translucent_shapes
 from full_geometry.settings import Settings
 from full_geometry.surface.wrapped import surface_of
 from full_geometry.trade.assessing import assess_stage
-from full_geometry.trade.results import ObjectTrade, WayTrade
-from full_geometry.trade.ways import GATHERED, LAMBERT, WALKS, Stage, Way
+from full_geometry.trade.job import Effort
+from full_geometry.trade.results import ObjectTrade, TechniqueTrade
+from full_geometry.trade.techniques import GATHERED, LAMBERT, WALKS, Stage, Technique
 from full_geometry.transport.models import model_names
 from halfspace_sss.neural.store import weights_folder
 from halfspace_sss.provenance import provenance, write_atomically
@@ -90,10 +91,10 @@ def _read(path: Path) -> dict[str, Any]:
 def _measured(on: Stage, named: list[str], settings: Settings) -> dict[str, Any]:
     lights = ("sampled", GATHERED) if settings.light == AUTO else (settings.light,)
     models = _known() if AUTO in named else dict.fromkeys(named)
-    ways = [WALKS]
-    ways += [_way(name, light) for name in models for light in lights if _has(name, light)]
-    samples = _samples(on, settings.choice_share / len(ways))
-    result = assess_stage(on, ways, samples=samples, exits=EXITS)
+    techniques = [WALKS]
+    techniques += [_way(name, light) for name in models for light in lights if _has(name, light)]
+    samples = _samples(on, settings.choice_share / len(techniques))
+    result = assess_stage(on, techniques, Effort(samples=samples, exits=EXITS))
     picks = {light: [picked(o, settings.tolerance, light, name) for o, name in zip(result.objects, named)]
              for light in lights}  # fmt: skip
     light = min(lights, key=lambda light: _total(picks[light]))
@@ -113,8 +114,8 @@ def _has(model: str, light: str) -> bool:
     return model != LAMBERT or light == "sampled"
 
 
-def _way(model: str, light: str) -> Way:
-    return Way(model, light=light if _has(model, light) else "sampled")
+def _way(model: str, light: str) -> Technique:
+    return Technique(model, light=light if _has(model, light) else "sampled")
 
 
 def _samples(on: Stage, share: float) -> int:
@@ -141,10 +142,10 @@ def _total(picks: list[Pick]) -> float:
 def picked(assessed: ObjectTrade, tolerance: float, light: str = "sampled", model: str = AUTO) -> Pick:
     """The model for an object among those of one kind of light, or what can be said of the one that is named."""
     names = _known() if model == AUTO else (model,)
-    ways = {_way(name, light).name: name for name in names}
-    rows = [row for row in assessed.ways if not row.refusal and row.way in ways]
+    techniques = {_way(name, light).name: name for name in names}
+    rows = [row for row in assessed.ways if not row.refusal and row.way in techniques]
     if not rows or assessed.is_dark:
-        name = _default([ways[row.way] for row in rows] or list(ways.values()))
+        name = _default([techniques[row.way] for row in rows] or list(techniques.values()))
         why = f"object {assessed.object!r}: {name}, as nothing is seen that could be compared"
         return Pick(name, 0.0 if rows else math.inf, why)
     keeping = [row for row in rows if row.bias_bound <= tolerance]
@@ -159,13 +160,13 @@ def picked(assessed: ObjectTrade, tolerance: float, light: str = "sampled", mode
     if not keeping or walks < cost:
         why += "; translucent_walk would be better"
         why += " and faster" if walks < cost else ", which has no bias"
-    return Pick(ways[best.way], cost if keeping else math.inf, f"object {assessed.object!r}: {best.way}, {why}")
+    return Pick(techniques[best.way], cost if keeping else math.inf, f"object {assessed.object!r}: {best.way}, {why}")
 
 
 def _default(names: list[str]) -> str:
     return DEFAULT if DEFAULT in names or not names else names[0]
 
 
-def _cost(assessed: ObjectTrade, row: WayTrade, tolerance: float) -> float:
+def _cost(assessed: ObjectTrade, row: TechniqueTrade, tolerance: float) -> float:
     """Seconds of an image until its noise is at the tolerance."""
     return row.preparation + assessed.pixels * row.time_to(tolerance) if row.variance >= 0 else math.inf

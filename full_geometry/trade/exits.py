@@ -7,7 +7,6 @@ by chance the few of them that are drawn would decide all means.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -46,7 +45,7 @@ class Exits:
         """The first n of them, which are as random as all."""
         return replace(self, o=self.o[:, :n], d=self.d[:, :n])
 
-    def rays(self, each: int) -> Any:
+    def rays(self, each: int) -> mi.Ray3f:
         """Every ray `each` times, next to each other."""
         index = dr.arange(mi.UInt32, self.n * each) // dr.opaque(mi.UInt32, each)
         o, d = (mi.TensorXf(v) for v in (self.o, self.d))
@@ -56,7 +55,7 @@ class Exits:
         return ray
 
 
-def visible_exits(scene: Any, shapes: list[Any], sensor: int, n: int, seed: int) -> list[Exits | None]:
+def visible_exits(scene: mi.Scene, shapes: list[mi.Shape], sensor: int, n: int, seed: int) -> list[Exits | None]:
     """For each shape n rays of a sensor that meet it first, fewer where it is hardly seen, None where it is not.
 
     Args:
@@ -86,7 +85,9 @@ def visible_exits(scene: Any, shapes: list[Any], sensor: int, n: int, seed: int)
     return made
 
 
-def _look(scene: Any, camera: Any, shapes: list[Any], seed: tuple[int, int]) -> tuple[np.ndarray, list[np.ndarray]]:
+def _look(
+    scene: mi.Scene, camera: mi.Sensor, shapes: list[mi.Shape], seed: tuple[int, int]
+) -> tuple[np.ndarray, list[np.ndarray]]:
     """Random rays of a camera, (6, LAUNCH), evenly over its film, and which of them meet each shape first."""
     rng = np.random.default_rng([*seed, 23])
     rows = rng.random((5, LAUNCH))
@@ -100,7 +101,7 @@ def _look(scene: Any, camera: Any, shapes: list[Any], seed: tuple[int, int]) -> 
     return np.broadcast_to(columns, (6, LAUNCH)) if columns.shape[1] == 1 else columns, hit
 
 
-def _shows_lamp(scene: Any, shapes: list[Any], si: Any, through: bool) -> Any:
+def _shows_lamp(scene: mi.Scene, shapes: list[mi.Shape], si: mi.SurfaceInteraction3f, through: bool) -> mi.Bool:
     """Whether smooth boundaries show an emitter other than the environment, as mirrors or `through` clear objects."""
     active, result, instance_scene = si.is_valid(), mi.Bool(False), InstanceScene([], {}, bounds_of(scene.shapes()))
     for _ in range(CHAIN):

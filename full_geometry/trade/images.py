@@ -17,13 +17,13 @@ from full_geometry.trade.image_differences import mean_flip
 from full_geometry.trade.results import Assessment
 from full_geometry.trade.sampling import radiance
 from full_geometry.trade.statistics import seeded
-from full_geometry.trade.ways import Stage, Way, stage
+from full_geometry.trade.techniques import Stage, Technique, stage
 
 SIDE, SPP = 40, 32
 
 
 def small_images(
-    on: Stage, chosen: Sequence[Way], sensor: int, seed: int, side: int = SIDE, spp: int = SPP
+    on: Stage, chosen: Sequence[Technique], sensor: int, seed: int, side: int = SIDE, spp: int = SPP
 ) -> dict[str, np.ndarray]:
     """Linear images (H, W, 3) of the ways that do not refuse the scene, by name; one seed for all.
 
@@ -39,12 +39,12 @@ def small_images(
     film = camera.film()
     small = _film(np.array(film.crop_size(), dtype=int), side)
     results = {}
-    for k, way in enumerate(chosen):
+    for k, technique in enumerate(chosen):
         try:
-            image = _rendered(mi, on.scene, camera, on.integrator(way), small, spp, seeded(seed, 51, k))
+            image = _rendered(on.scene, camera, on.integrator(technique), small, spp, seeded(seed, 51, k))
         except (ValueError, RuntimeError):
             continue
-        results[way.name] = image
+        results[technique.name] = image
     return results
 
 
@@ -54,7 +54,7 @@ def _film(size: np.ndarray, side: int) -> tuple[int, int]:
 
 
 def _rendered(
-    mi: Any, scene: Any, camera: Any, integrator: Any, size: tuple[int, int], spp: int, seed: int
+    scene: mi.Scene, camera: mi.Sensor, integrator: mi.Integrator, size: tuple[int, int], spp: int, seed: int
 ) -> np.ndarray:
     """Rays of the camera over its whole film, averaged in fewer pixels."""
     n = size[0] * size[1] * spp
@@ -74,7 +74,7 @@ def _rendered(
 
 def with_flip(
     on: Stage,
-    chosen: Sequence[Way],
+    chosen: Sequence[Technique],
     assessment: Assessment,
     sensor: int,
     seed: int,
@@ -95,7 +95,9 @@ def with_flip(
     if find_spec("flip_evaluator") is None or all(o.is_dark for o in assessment.objects):
         return assessment
     measured = {PATH_TRACED, *(w.way for o in assessment.objects for w in o.ways if not w.refusal)}
-    shown = [way for way in chosen if way.name in measured]  # others would gather light for a number that is not told
+    shown = [
+        technique for technique in chosen if technique.name in measured
+    ]  # others would gather light for a number that is not told
     images = small_images(on, shown, sensor, seed, spp=spp) if images is None else images
     truth = images[PATH_TRACED]
     again = small_images(on, [chosen[0]], sensor, seeded(seed, 52), max(truth.shape), spp)[PATH_TRACED]
@@ -150,5 +152,5 @@ def picture_of(
     images: Mapping[str, np.ndarray] = {}
     if names:
         on = stage(file, how["parameters"])
-        images = small_images(on, [Way.of(name) for name in names], how["sensor"], how["seed"], PAGE_SIDE, SPP)
+        images = small_images(on, [Technique.of(name) for name in names], how["sensor"], how["seed"], PAGE_SIDE, SPP)
     return TradePicture(file.stem, assessment, tolerance, tuple(sentences), images)

@@ -19,14 +19,14 @@ DOUBT = 1.0  # standard errors that count as error: biases spread over decades, 
 
 
 @dataclass(frozen=True)
-class WayTrade:
+class TechniqueTrade:
     """One way of rendering one object.
 
     Attributes:
         way: its name.
         bias2: squared relative error of radiance that no number of samples removes, noise taken out; it may come out
-            below 0. Mean over visible exits and channels, over the square of the mean radiance. By soft light under an
-            environment map, where a tolerance is asked, as `ratio` is: see `soft_light`.
+            below 0. Mean over visible exits and channels, over the square of the mean radiance. By a smoothed
+            environment map, where a tolerance is asked, as `ratio` is: see `smoothed_environment`.
         bias2_error: its standard error.
         ratio, ratio_error: mean radiance over that of walks, for each channel, with standard errors.
         variance, variance_error: of one sample without fireflies (`statistics.FIREFLIES`), over the square of the mean
@@ -93,7 +93,7 @@ class WayTrade:
         return self.variance / noise**2 * self.seconds
 
 
-def samples_for(row: WayTrade, tolerance: float, z: float = DOUBT) -> float:
+def samples_for(row: TechniqueTrade, tolerance: float, z: float = DOUBT) -> float:
     """Samples n of a pixel by which bias² + variance / n and z of its standard errors are at tolerance²; inf for none.
 
     With a = tolerance² - bias² the smaller root of (a - V / n)² = z² (s² + (v / n)²).
@@ -124,10 +124,10 @@ class ObjectTrade:
     share: float
     pixels: float
     radiance: tuple[float, ...]
-    ways: tuple[WayTrade, ...]
+    ways: tuple[TechniqueTrade, ...]
     notes: tuple[str, ...] = ()
 
-    def way(self, name: str) -> WayTrade:
+    def way(self, name: str) -> TechniqueTrade:
         """The row of a way; ValueError if there is none."""
         for row in self.ways:
             if row.way == name:
@@ -135,7 +135,7 @@ class ObjectTrade:
         raise ValueError(f"way must be one of {', '.join(row.way for row in self.ways)}, got {name!r}")
 
     @property
-    def traced(self) -> WayTrade:
+    def traced(self) -> TechniqueTrade:
         """The row of walks."""
         return self.way(PATH_TRACED)
 
@@ -188,7 +188,7 @@ class Assessment:
         """From a record."""
         objects = []
         for o in record["objects"]:
-            rows = tuple(WayTrade(**{key: _known(key, value) for key, value in w.items()}) for w in o["ways"])
+            rows = tuple(TechniqueTrade(**{key: _known(key, value) for key, value in w.items()}) for w in o["ways"])
             lists = {key: tuple(o[key]) for key in ("mfp", "radiance", "notes")}
             objects.append(ObjectTrade(**{**o, **lists, "ways": rows}))
         return cls(tuple(objects), record["seconds"], record["compilation"], record["seed"])
@@ -204,7 +204,7 @@ def plain(value: Any) -> Any:
 
 
 def _known(key: str, value: Any) -> Any:
-    """A field of a `WayTrade` from JSON."""
+    """A field of a `TechniqueTrade` from JSON."""
     if key in ("ratio", "ratio_error"):
         return tuple(math.nan if v is None else v for v in value)
     return math.nan if value is None and key not in ("flip", "flip_noise") else value

@@ -6,7 +6,7 @@ import contextlib
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -18,7 +18,7 @@ from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.settings import variant_channels
 from full_geometry.trade.exits import Exits
 from full_geometry.trade.statistics import RadianceEstimate, seeded
-from full_geometry.trade.ways import Stage, Way
+from full_geometry.trade.techniques import Stage, Technique
 from halfspace_sss.backend import clock
 
 LANES = 2**18  # of a launch
@@ -60,39 +60,41 @@ class Sampled:
         return min(max(took - self.overhead, LEAST_SHARE * took) / n for n, took in self.launches)
 
 
-def first_sample(stage: Stage, way: Way, exits: Exits, seed: int, each: int = PILOT, object: int = 0) -> Sampled:
+def first_sample(
+    stage: Stage, technique: Technique, exits: Exits, seed: int, each: int = PILOT, object: int = 0
+) -> Sampled:
     """Make a way ready and take few samples, which compiles its kernels; nothing if an earlier look knows its pace.
 
     Raises:
         ValueError: the way refuses the scene.
     """
-    if (object, way) in stage.paces:
+    if (object, technique) in stage.paces:
         estimate = RadianceEstimate(variant_channels(), exits.n)
-        return replace(stage.paces[object, way], estimate=estimate, preparing=0.0, compilation=0.0, compiling=0.0)
+        return replace(stage.paces[object, technique], estimate=estimate, preparing=0.0, compilation=0.0, compiling=0.0)
     started = clock()
-    _prepare(stage, way)
+    _prepare(stage, technique)
     preparation = preparing = clock() - started
-    if way.part:  # of all samples, after what is made ready for parts and whole alike
-        made, light = stage.integrator(way).gathering.seconds
+    if technique.part:  # of all samples, after what is made ready for parts and whole alike
+        made, light = stage.integrator(technique).gathering.seconds
         preparation = max(preparing - made - light, 0.0) + made / PART + 2 * light
-        same = stage.paces.get((object, replace(way, light="sampled", part=0)))  # which made the objects for both
+        same = stage.paces.get((object, replace(technique, light="sampled", part=0)))  # which made the objects for both
         preparation += same.preparation if same else 0.0
     result = Sampled(RadianceEstimate(variant_channels(), exits.n), preparation, preparing)
-    _first_launch(stage, way, exits, result, each, seeded(seed, 31))
-    stage.paces[object, way] = result
+    _first_launch(stage, technique, exits, result, each, seeded(seed, 31))
+    stage.paces[object, technique] = result
     return result
 
 
-def _first_launch(stage: Stage, way: Way, exits: Exits, sampled: Sampled, each: int, seed: int) -> None:
+def _first_launch(stage: Stage, technique: Technique, exits: Exits, sampled: Sampled, each: int, seed: int) -> None:
     """`each` samples of every exit; where a kernel was compiled the same again, for the time alone."""
     began = time.perf_counter()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
-        launch = _launch(stage, way, exits, sampled.estimate, each, seed)
+        launch = _launch(stage, technique, exits, sampled.estimate, each, seed)
         kernels = dr.kernel_history([dr.KernelType.JIT])
     ended = time.perf_counter()
     if not all(kernel["cache_hit"] for kernel in kernels):
-        again = _launch(stage, way, exits, RadianceEstimate(variant_channels(), exits.n), each, seed)
+        again = _launch(stage, technique, exits, RadianceEstimate(variant_channels(), exits.n), each, seed)
         sampled.compiling = max(launch.seconds - again.seconds, 0.0)
         sampled.compilation = max(2 * ended - began - time.perf_counter(), 0.0)
         launch = again
@@ -101,23 +103,25 @@ def _first_launch(stage: Stage, way: Way, exits: Exits, sampled: Sampled, each: 
     sampled.launches.append((exits.n * each, launch.seconds))
 
 
-def warm_up(stage: Stage, ways: Sequence[Way]) -> None:
+def warm_up(stage: Stage, techniques: Sequence[Technique]) -> None:
     """Compile what preparation needs, by the first way that does not refuse the scene, and forget that way again."""
-    for way in () if any(way in [known for _, known in stage.paces] for way in ways) else ways:
+    for technique in (
+        () if any(technique in [known for _, known in stage.paces] for technique in techniques) else techniques
+    ):
         with contextlib.suppress(ValueError, RuntimeError):
-            _prepare(stage, way)
-            stage.forget(way)
+            _prepare(stage, technique)
+            stage.forget(technique)
             return
 
 
-def _prepare(stage: Stage, way: Way) -> None:
-    integrator = stage.integrator(way)
-    (integrator.prepare if is_bssrdf(integrator) else integrator.tracer)(stage.lit(way))
+def _prepare(stage: Stage, technique: Technique) -> None:
+    integrator = stage.integrator(technique)
+    (integrator.prepare if is_bssrdf(integrator) else integrator.tracer)(stage.lit(technique))
 
 
 def sample_more(
     stage: Stage,
-    way: Way,
+    technique: Technique,
     exits: Exits,
     sampled: Sampled,
     seed: int,
@@ -148,7 +152,7 @@ def sample_more(
             return
         each = min(each, most)
         number = seeded(seed, 32, sampled.estimate.samples)
-        launch = _launch(stage, way, exits, sampled.estimate, each, number)
+        launch = _launch(stage, technique, exits, sampled.estimate, each, number)
         sampled.memory = max(sampled.memory, launch.memory)
         sampled.launches.append((exits.n * each, launch.seconds))
 
@@ -164,11 +168,13 @@ def sample_blur(stage: Stage, exits: Exits, seed: int, samples: int) -> Radiance
         seed: of the samples.
         samples: of each exit.
     """
-    ways = [Way(PATH_TRACED, blur=blur) for blur in (0.0, BLUR)]
+    techniques = [Technique(PATH_TRACED, blur=blur) for blur in (0.0, BLUR)]
     estimate, most = RadianceEstimate(variant_channels(), exits.n), max(LANES // exits.n, 2)
     while (each := min(samples - estimate.samples, most)) > 0:
         number, rays = seeded(seed, 33, estimate.samples), exits.rays(each)
-        without, spread = (radiance(stage.lit(w), stage.integrator(w), _sampler(number, rays), rays) for w in ways)
+        without, spread = (
+            radiance(stage.lit(w), stage.integrator(w), _sampler(number, rays), rays) for w in techniques
+        )
         estimate.add(*_sums([b - a for a, b in zip(without, spread)], each), each)
     return estimate
 
@@ -186,13 +192,15 @@ class TimedLaunch(NamedTuple):
     recording: float
 
 
-def _launch(stage: Stage, way: Way, exits: Exits, estimate: RadianceEstimate, each: int, seed: int) -> TimedLaunch:
+def _launch(
+    stage: Stage, technique: Technique, exits: Exits, estimate: RadianceEstimate, each: int, seed: int
+) -> TimedLaunch:
     """`each` samples of every exit."""
     rays = exits.rays(each)
     dr.flush_malloc_cache()
     dr.detail.malloc_clear_statistics()
     started = clock()
-    L = _recorded(stage.lit(way), stage.integrator(way), _sampler(seed, rays), rays)
+    L = _recorded(stage.lit(technique), stage.integrator(technique), _sampler(seed, rays), rays)
     recorded = clock()
     dr.eval(L)
     first, second = _sums(L, each)
@@ -203,14 +211,14 @@ def _launch(stage: Stage, way: Way, exits: Exits, estimate: RadianceEstimate, ea
     return TimedLaunch(memory, ended - started, recorded - started)
 
 
-def _sampler(seed: int, rays: Any) -> Any:
+def _sampler(seed: int, rays: mi.Ray3f) -> mi.Sampler:
     """Independent numbers for each ray."""
     result = mi.load_dict({"type": "independent"})
     result.seed(seed, dr.width(rays))
     return result
 
 
-def _sums(L: list[Any], each: int) -> tuple[np.ndarray, np.ndarray]:
+def _sums(L: list[mi.Float], each: int) -> tuple[np.ndarray, np.ndarray]:
     """Of values and of squares over the samples of each exit, (channels, n)."""
 
     sums = [dr.block_sum(v, each) for c in L for v in (c, c * c)]
@@ -222,7 +230,7 @@ def _sums(L: list[Any], each: int) -> tuple[np.ndarray, np.ndarray]:
     return rows[0::2], rows[1::2]
 
 
-def radiance(scene: Any, integrator: Any, sampler: Any, ray: Any) -> list[Any]:
+def radiance(scene: mi.Scene, integrator: mi.Integrator, sampler: mi.Sampler, ray: mi.Ray3f) -> list[mi.Float]:
     """Radiance of rays, by channel, by one kernel for all that it is asked for.
 
     It is evaluated at once, as sums evaluate what they are given and would trace all paths for each channel anew.
@@ -238,7 +246,7 @@ def radiance(scene: Any, integrator: Any, sampler: Any, ray: Any) -> list[Any]:
     return L
 
 
-def _recorded(scene: Any, integrator: Any, sampler: Any, ray: Any) -> list[Any]:
+def _recorded(scene: mi.Scene, integrator: mi.Integrator, sampler: mi.Sampler, ray: mi.Ray3f) -> list[mi.Float]:
     """Radiance of rays that is to be evaluated."""
     sampler.schedule_state()
     dr.schedule(ray.o, ray.d)

@@ -13,7 +13,7 @@ import drjit as dr  # noqa: E402
 from full_geometry.objects.objects import object_of  # noqa: E402
 from full_geometry.scenes.mitsuba_scene import with_media  # noqa: E402
 from full_geometry.surface.translucent import is_smooth_boundary, smooth_boundary  # noqa: E402
-from full_geometry.trade.ways import ways  # noqa: E402
+from full_geometry.trade.techniques import techniques  # noqa: E402
 
 N, BOTH = 4000, 0xFFFFFFFF
 
@@ -110,7 +110,7 @@ def test_a_tinted_or_rough_boundary_is_refused_by_every_way_but_walks_which_trac
         "light": {"type": "constant"},
     }
     loaded = mi.load_dict(described)
-    asked = [{"model": way.model, "light": way.light} for way in ways() if not way.walks]
+    asked = [{"model": way.model, "light": way.light} for way in techniques() if not way.walks]
     asked += [{"model": "auto"}, {"light": "auto"}, *({"orders": orders} for orders in ("single", "multiple"))]
     preparations = [mi.load_dict({"type": "bssrdf", **each}).prepare for each in asked]
     for ask in (*preparations, lambda scene: object_of(scene, None, 1.0)):

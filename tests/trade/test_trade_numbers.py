@@ -11,10 +11,11 @@ import pytest
 from full_geometry.cli import trade
 from full_geometry.integrators.gathering import PART, Gathered, Gathering
 from full_geometry.trade import recommend
-from full_geometry.trade.advice import Job, advise
+from full_geometry.trade.advice import advise
 from full_geometry.trade.automatic import picked
 from full_geometry.trade.contending import contenders, left_out, most_promising
-from full_geometry.trade.results import Assessment, ObjectTrade, WayTrade, samples_for
+from full_geometry.trade.job import Job
+from full_geometry.trade.results import Assessment, ObjectTrade, TechniqueTrade, samples_for
 from full_geometry.trade.statistics import (
     FIREFLIES,
     RadianceEstimate,
@@ -22,7 +23,7 @@ from full_geometry.trade.statistics import (
     mean_square_of_parts,
     relative_variance,
 )
-from full_geometry.trade.ways import Way
+from full_geometry.trade.techniques import Technique
 
 SEEDS, EXITS, SAMPLES = 400, 48, 12
 
@@ -117,7 +118,7 @@ def test_the_kept_noise_of_gathered_parts_is_half_that_of_light_and_a_part_of_th
 def test_as_many_samples_are_taken_as_keep_the_tolerance_one_standard_error_above_what_was_measured(
     bias2: float, bias2_error: float, error: float
 ) -> None:
-    row = WayTrade("neural", bias2, bias2_error, (1.0,), (0.0,), 1.0, error, 1e-6, 100)
+    row = TechniqueTrade("neural", bias2, bias2_error, (1.0,), (0.0,), 1.0, error, 1e-6, 100)
     n, tolerance = samples_for(row, 0.05), 0.05
     bound = max(bias2, 0) + 1 / n + math.hypot(bias2_error, error / n)
     assert bound == pytest.approx(tolerance**2, rel=1e-9)
@@ -127,15 +128,15 @@ def test_as_many_samples_are_taken_as_keep_the_tolerance_one_standard_error_abov
 def test_a_second_look_is_at_what_may_be_the_cheapest() -> None:
     dear, wrong = _way("neural", 0.01, 0.01, 1e-3), _way("lambert", 0.3, 0.01, 1e-9)
     doubtful = _way("better_dipole", 0.05, 0.2, 1e-7)
-    found = _assessment(dear, wrong, doubtful, WayTrade("full_geometry", refusal="it must be trained")).objects[0]
+    found = _assessment(dear, wrong, doubtful, TechniqueTrade("full_geometry", refusal="it must be trained")).objects[0]
     assert contenders(found, 0.1) == ["better_dipole"]
 
 
-def _way(name: str, bias: float, error: float, cost: float, **more) -> WayTrade:
-    return WayTrade(name, bias**2, error**2, (1.0,), (0.0,), 1.0, 0.0, cost, 100, **more)
+def _way(name: str, bias: float, error: float, cost: float, **more) -> TechniqueTrade:
+    return TechniqueTrade(name, bias**2, error**2, (1.0,), (0.0,), 1.0, 0.0, cost, 100, **more)
 
 
-def _assessment(*ways: WayTrade, radiance: float = 1.0) -> Assessment:
+def _assessment(*ways: TechniqueTrade, radiance: float = 1.0) -> Assessment:
     ways = (_way("path_traced", 0.0, 0.0, 1e-5), *ways)
     return Assessment((ObjectTrade("ball", (30.0, 40.0), 0.5, 100.0, (radiance,), ways),), 1.0, 0.0, 0)
 
@@ -149,13 +150,13 @@ def test_the_cheapest_way_that_keeps_the_tolerance_is_recommended(tolerance: flo
 
 
 def test_a_square_that_noise_put_far_below_zero_keeps_no_tolerance_below_its_standard_error() -> None:
-    lucky = WayTrade("standard_dipole", -1.0, 0.1, (1.0,), (0.0,), 1.0, 0.0, 1e-9, 100)
+    lucky = TechniqueTrade("standard_dipole", -1.0, 0.1, (1.0,), (0.0,), 1.0, 0.0, 1e-9, 100)
     assert lucky.bias == 0.0 and lucky.bias_bound == pytest.approx(math.sqrt(1.645 * 0.1))
     assert recommend(_assessment(lucky), tolerance=0.3).objects[0].way == "path_traced"
 
 
 def test_a_bias_that_noise_hides_is_told_as_a_bound_and_never_as_0() -> None:
-    lucky = WayTrade("standard_dipole", -1e-3, 1e-4, (1.0,), (0.0,), 1.0, 0.0, 1e-9, 100)
+    lucky = TechniqueTrade("standard_dipole", -1e-3, 1e-4, (1.0,), (0.0,), 1.0, 0.0, 1e-9, 100)
     (walks, row), found = _assessment(lucky).objects[0].ways, _assessment(lucky)
     assert lucky.told_bias == "< 1.3" and trade._row(row)[1] == "< 1.3" and trade._row(walks)[1] == "exact"
     why = {option.way: option.why for option in recommend(found, tolerance=0.011).objects[0].options}
@@ -164,7 +165,7 @@ def test_a_bias_that_noise_hides_is_told_as_a_bound_and_never_as_0() -> None:
 
 
 def test_every_way_gets_one_sentence() -> None:
-    refused = WayTrade("full_geometry", refusal="it must be trained")
+    refused = TechniqueTrade("full_geometry", refusal="it must be trained")
     doubtful = _way("better_dipole", 0.05, 0.2, 1e-7)
     found = recommend(_assessment(CHEAP, GOOD, doubtful, refused), tolerance=0.1).objects[0]
     why = {option.way: option.why for option in found.options}
@@ -224,19 +225,19 @@ def test_auto_takes_gathered_light_only_where_it_is_asked_for_and_counts_its_pre
 
 @pytest.mark.parametrize("way", ["path_traced", "neural", "neural, gathered", "neural, without single scattering"])
 def test_a_way_comes_back_by_its_name(way: str) -> None:
-    assert Way.of(way).name == way
+    assert Technique.of(way).name == way
 
 
 @pytest.mark.parametrize("unknown", ["lambert, gathered", "neural, collected"])
 def test_a_way_that_does_not_exist_is_refused(unknown: str) -> None:
     with pytest.raises(ValueError, match="what follows"):
-        Way.of(unknown)
+        Technique.of(unknown)
 
 
 @pytest.mark.parametrize("more", ["gathered", "without single scattering"])
 def test_path_traced_is_a_way_of_its_own(more: str) -> None:
     with pytest.raises(ValueError, match=f"the way 'path_traced' must stand alone, got 'path_traced, {more}'"):
-        Way.of(f"path_traced, {more}")
+        Technique.of(f"path_traced, {more}")
 
 
 def test_a_record_comes_back_as_it_was() -> None:
@@ -278,18 +279,18 @@ def test_light_is_gathered_for_an_assessment_only_where_it_may_win(
     found = _assessment(_way("neural", 0.01, 0.001, 2e-6)).objects[
         0
     ]  # at least 2.1 s of gathering, of two parts 0.26 s
-    why = left_out(found, Way.of("neural, gathered"), tolerance, images, seconds)
+    why = left_out(found, Technique.of("neural, gathered"), Job(tolerance, images), seconds)
     assert why.endswith(reason) and bool(why) == bool(reason)
 
 
 def test_the_light_of_the_model_is_gathered_by_which_the_job_is_expected_to_end_first() -> None:
-    ways = [Way.of("neural, gathered"), Way.of("better_dipole, gathered")]
+    ways = [Technique.of("neural, gathered"), Technique.of("better_dipole, gathered")]
     close = _assessment(_way("neural", 0.02, 0.03, 4e-6), _way("better_dipole", 0.03, 0.03, 2e-6)).objects
     apart = _assessment(_way("neural", 0.02, 0.01, 4e-6), _way("better_dipole", 0.1, 0.01, 2e-6)).objects
     dear = _assessment(_way("neural", 0.02, 0.01, 4e-6), _way("better_dipole", 0.01, 0.01, 2e-6, training=1e4)).objects
-    assert most_promising(close, ways, 0.05, 10) == ways[1]
-    assert most_promising(apart, ways, 0.05, 10_000) == ways[0]
-    assert most_promising(dear, ways, 0.05, 10_000) == ways[0]
+    assert most_promising(close, ways, Job(0.05, 10)) == ways[1]
+    assert most_promising(apart, ways, Job(0.05, 10_000)) == ways[0]
+    assert most_promising(dear, ways, Job(0.05, 10_000)) == ways[0]
 
 
 def test_of_the_noise_of_gathered_light_what_a_render_keeps_counts_as_bias() -> None:

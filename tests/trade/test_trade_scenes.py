@@ -16,8 +16,9 @@ from full_geometry.trade import assess, flat, measuring, recommend, sampling
 from full_geometry.trade.assessing import assess_stage
 from full_geometry.trade.exits import visible_exits
 from full_geometry.trade.images import small_images
+from full_geometry.trade.job import Effort, Job
 from full_geometry.trade.sampling import first_sample, sample_more
-from full_geometry.trade.ways import Way, stage
+from full_geometry.trade.techniques import Technique, stage
 from full_geometry.transport.models import model_names
 from halfspace_sss import Medium
 from halfspace_sss.physics.fresnel import F_r
@@ -59,8 +60,11 @@ def scene(medium: dict | None = None, light: dict | None = None, n: int = 1, **m
 
 
 def test_a_ball_of_ten_mean_free_paths_is_as_dark_by_a_half_space_as_images_say() -> None:
-    on, ways = stage(scene({"sigma_s": 9.5, "sigma_a": 0.5, "eta": 1.3})), [Way.of("path_traced"), Way.of("neural")]
-    found = assess_stage(on, ways, samples=1024, exits=64)
+    on, ways = (
+        stage(scene({"sigma_s": 9.5, "sigma_a": 0.5, "eta": 1.3})),
+        [Technique.of("path_traced"), Technique.of("neural")],
+    )
+    found = assess_stage(on, ways, Effort(samples=1024, exits=64))
     row = found.objects[0].way("neural")
     # 0.85 of light from inside is left (spheres), and all that is reflected or single; four seeds: 0.845 to 0.86
     assert row.ratio[0] == pytest.approx(0.87, abs=0.05) and row.bias > 0.05
@@ -136,7 +140,7 @@ QUICK_ASSESS = {"assess_seconds": 0.4, "exits": 64}
 def test_all_channels_of_exits_and_images_are_traced_once_and_by_one_kernel() -> None:
     import drjit as dr
 
-    on, way = stage(scene()), Way.of("better_dipole")
+    on, way = stage(scene()), Technique.of("better_dipole")
     (exits,) = visible_exits(on.scene, on.shapes, 0, 32, 0)
     found = first_sample(on, way, exits, 0)
     known = len(found.launches)
@@ -176,30 +180,30 @@ def windows() -> np.ndarray:
     return pixels
 
 
-def test_the_second_look_goes_on_with_the_samples_of_the_first_and_tells_biases_by_soft_light(
+def test_the_second_look_goes_on_with_the_samples_of_the_first_and_tells_biases_by_a_smoothed_environment(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     lit = stage(scene(light={"type": "envmap", "bitmap": mi.Bitmap(windows())}, orders="multiple")).scene
     pixels = np.array(mi.traverse(lit.environment())["data"])
-    known: list[tuple[Way, int, Any]] = []
+    known: list[tuple[Technique, int, Any]] = []
     shown: list[tuple[bool, float]] = []
 
-    def noted(on: Any, way: Way, points: Any, sampled: Any, *args: Any, **more: Any) -> None:
+    def noted(on: Any, way: Technique, points: Any, sampled: Any, *args: Any, **more: Any) -> None:
         known.append((way, sampled.estimate.samples, sampled))
         sample_more(on, way, points, sampled, *args, **more)
 
-    def launched(on: Any, way: Way, *args: Any) -> Any:
+    def launched(on: Any, way: Technique, *args: Any) -> Any:
         result = launch(on, way, *args)
-        shown.append((way.soft, float(np.array(mi.traverse(lit.environment())["data"]).max())))
+        shown.append((way.smoothed, float(np.array(mi.traverse(lit.environment())["data"]).max())))
         return result
 
     launch = sampling._launch
     monkeypatch.setattr(measuring, "sample_more", noted)
     monkeypatch.setattr(sampling, "_launch", launched)
     asked = ["better_dipole", "better_dipole, gathered"]
-    found = assess(lit, models=asked, tolerance=0.05, **QUICK).objects[0]
-    counts = [samples for way, samples, _ in known if way == Way("path_traced", soft=True)]
-    (walks,) = {sampled for way, _, sampled in known if way == Way("path_traced", soft=True)}
+    found = assess(lit, models=asked, job=Job(0.05), **QUICK).objects[0]
+    counts = [samples for way, samples, _ in known if way == Technique("path_traced", smoothed=True)]
+    (walks,) = {sampled for way, _, sampled in known if way == Technique("path_traced", smoothed=True)}
     assert counts == sorted(counts) and 0 < counts[0] < walks.estimate.samples
     assert all((brightest < 9) == soft for soft, brightest in shown)
     assert np.array_equal(np.array(mi.traverse(lit.environment())["data"]), pixels)
@@ -209,7 +213,7 @@ def test_the_second_look_goes_on_with_the_samples_of_the_first_and_tells_biases_
 
 
 def test_soft_light_keeps_the_mean_and_the_first_moment_of_an_environment() -> None:
-    from full_geometry.trade.soft_light import smoothed
+    from full_geometry.trade.smoothed_environment import smoothed
 
     own = np.concatenate([windows()[:, -1:], windows(), windows()[:, :1]], axis=1)
     theta, phi = np.linspace(0, np.pi, 32)[:, None], (np.arange(64) + 0.5) * np.pi / 32
@@ -221,7 +225,7 @@ def test_soft_light_keeps_the_mean_and_the_first_moment_of_an_environment() -> N
 
 def test_a_point_through_which_a_lamp_would_be_seen_is_left_out() -> None:
     from full_geometry.trade.exits import visible_exits
-    from full_geometry.trade.ways import stage
+    from full_geometry.trade.techniques import stage
 
     lit = scene({"sigma_s": 9.5, "sigma_a": 0.5, "eta": 1.0})
     lamp = {"type": "sphere", "center": [0, 0, -5.0], "radius": 0.4}
@@ -300,7 +304,7 @@ def test_auto_is_chosen_of_all_models_once_kept_and_found_again(tmp_path: Path) 
 @pytest.mark.parametrize(("share", "spp", "samples"), [(0.0, 4, 64), (0.5, 256, 1365), (1.0, 1024, 2048)])
 def test_the_choice_takes_its_share_of_the_samples_of_an_image(share: float, spp: int, samples: int) -> None:
     from full_geometry.trade.automatic import _samples
-    from full_geometry.trade.ways import stage
+    from full_geometry.trade.techniques import stage
 
     asked = scene(model="auto")
     asked["sensor"]["sampler"] = {"type": "independent", "sample_count": spp}
@@ -403,11 +407,11 @@ def test_the_figure_and_the_page_are_drawn() -> None:
     from benchmarks.trade_tables import multiples
     from figures.drawing.trade_plot import render
     from full_geometry.trade.images import TradePicture
-    from full_geometry.trade.results import Assessment, ObjectTrade, WayTrade
+    from full_geometry.trade.results import Assessment, ObjectTrade, TechniqueTrade
 
     numbers = {"ratio": (1.0,), "ratio_error": (0.0,), "variance": 1.0, "variance_error": 0.1, "samples": 9}
-    ways = [WayTrade("path_traced", 0.0, 0.0, seconds=1e-5, **numbers)]
-    ways += [WayTrade(name, 0.01, 0.001, seconds=1e-6, **numbers) for name in ("neural", "lambert")]
+    ways = [TechniqueTrade("path_traced", 0.0, 0.0, seconds=1e-5, **numbers)]
+    ways += [TechniqueTrade(name, 0.01, 0.001, seconds=1e-6, **numbers) for name in ("neural", "lambert")]
     ball = ObjectTrade("ball", (3.0, 4.0), 0.5, 100.0, (1.0,), tuple(ways))
     images = {way.way: np.full((8, 8, 3), 0.5, np.float32) for way in ways}
     files = render(TradePicture("ball", Assessment((ball,), 1.0, 0.0, 0), 0.05, ("neural",), images))

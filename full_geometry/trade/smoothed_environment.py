@@ -1,9 +1,9 @@
-"""Soft light: an environment map smoothed over directions, in which few walks tell how wrong a model is.
+"""An environment map smoothed over directions, by which few walks tell how wrong a model is.
 
 A walk through a refracting boundary meets a window by chance alone. What S makes of light after two orders and more
-varies little over direction, so that smooth light leaves its relative error nearly what it is (docs/choosing.md):
+varies little over direction, so that a smoothed map leaves its relative error nearly what it is (docs/choosing.md):
 
-    L'(w) = c + g [∫ K(w.w') L(w') dw' - c],  K(x) = κ exp(κ (x - 1)) / (2 pi (1 - exp(-2 κ))),  κ = 1 / SOFT²,
+    L'(w) = c + g [∫ K(w.w') L(w') dw' - c],  K(x) = κ exp(κ (x - 1)) / (2 pi (1 - exp(-2 κ))),  κ = 1 / WIDTH²,
 
 with c the mean of L over the sphere, which L' keeps. g = 1 / (coth κ - 1/κ) keeps its first moment too; it is less
 where L' would be below 0.
@@ -13,33 +13,32 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
-SOFT = 0.4  # radians
+WIDTH = 0.4  # radians
 ROWS = 17  # of the map of L', from pole to pole
 LOOKED_AT = 64  # rows of L at most: blocks of more pixels are taken together
 
 
 @dataclass(eq=False)
-class SoftLight:
-    """The environment map of a scene, which shows its own light or soft light.
+class SmoothedEnvironment:
+    """The environment map of a scene, which shows its own or its smoothed pixels.
 
     Args:
         parameters: of the emitter.
-        own, soft: pixels of both.
+        own, blurred: pixels of both.
     """
 
-    parameters: Any
-    own: Any
-    soft: Any
-    _is_soft: bool = False
+    parameters: mi.SceneParameters
+    own: mi.TensorXf
+    blurred: mi.TensorXf
+    _is_smoothed: bool = False
 
     @classmethod
-    def of(cls, scene: mi.Scene) -> SoftLight | None:
-        """That of a scene; None if it has no environment map, or one of so few pixels that it is soft."""
+    def of(cls, scene: mi.Scene) -> SmoothedEnvironment | None:
+        """The map of a scene; None if there is none, or one of so few pixels that it is smooth."""
         sky = scene.environment()
         if sky is None or sky.class_name() != "EnvironmentMapEmitter" or mi.is_spectral:
             return None
@@ -47,10 +46,10 @@ class SoftLight:
         own = mi.TensorXf(parameters["data"])  # a copy, as the emitter changes what it gives
         return cls(parameters, own, mi.TensorXf(smoothed(np.array(own)))) if len(own) > ROWS else None
 
-    def show(self, soft: bool) -> None:
-        """Let the scene have its own light or soft light."""
-        if soft != self._is_soft:
-            self.parameters["data"], self._is_soft = self.soft if soft else self.own, soft
+    def show(self, smoothed: bool) -> None:
+        """Let the scene have its own or the smoothed map."""
+        if smoothed != self._is_smoothed:
+            self.parameters["data"], self._is_smoothed = self.blurred if smoothed else self.own, smoothed
             self.parameters.update()
 
 
@@ -67,7 +66,7 @@ def smoothed(pixels: np.ndarray) -> np.ndarray:
     flux = np.add.reduceat(flux, columns, axis=1).reshape(-1, L.shape[2])
     flux *= 2 * math.pi**2 / (len(theta) - 1) / len(phi)
     means = (np.add.reduceat(angle, at) / np.diff([*at, len(angle)]) for angle, at in ((theta, rows), (phi, columns)))
-    kappa, few = 1 / SOFT**2, _angles(ROWS, 2 * ROWS - 2)
+    kappa, few = 1 / WIDTH**2, _angles(ROWS, 2 * ROWS - 2)
     K = np.exp(kappa * (_directions(*few) @ _directions(*means).T - 1))
     c, blurred = flux.sum(axis=0) / (4 * math.pi), K @ flux * kappa / (2 * math.pi * -math.expm1(-2 * kappa))
     g = min(1 / (1 / math.tanh(kappa) - 1 / kappa), float((c / np.maximum(c - blurred, 1e-30)).min()))

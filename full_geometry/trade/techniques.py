@@ -1,11 +1,12 @@
-"""The ways in which a scene can be rendered, and the same loaded scene shown by one after the other."""
+"""The techniques by which a scene can be rendered, and the same loaded scene rendered by one after the other."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
 
@@ -15,10 +16,13 @@ from full_geometry.integrators.gathering import Gathering
 from full_geometry.objects.objects import KnowsUnit, millimetres, refuse_instances, translucent_shapes
 from full_geometry.objects.small_emitters import is_delta
 from full_geometry.scenes.scene_files import PATH_TRACED, load_objects
-from full_geometry.trade.soft_light import SoftLight
+from full_geometry.trade.smoothed_environment import SmoothedEnvironment
 from full_geometry.transport.models import model_names
 from halfspace_sss.checks import check_choice
 from halfspace_sss.registry import model_class, models
+
+if TYPE_CHECKING:
+    from full_geometry.trade.sampling import Sampled
 
 LAMBERT = "lambert"
 NO_SINGLE = "without single scattering"
@@ -26,7 +30,7 @@ GATHERED = "gathered"
 
 
 @dataclass(frozen=True)
-class Way:
+class Technique:
     """A model for all objects, or "path_traced"; with orders instead of those of the scene, if any.
 
     Args:
@@ -35,7 +39,7 @@ class Way:
         light: "sampled" or "gathered", see `Settings`.
         part: of gathered light, see `Gathering`; 0 for all of it.
         blur: of walks, see `translucent_walk`.
-        soft: whether it is looked at in soft light, see `soft_light`.
+        smoothed: whether by the smoothed environment, see `smoothed_environment`.
     """
 
     model: str
@@ -43,7 +47,7 @@ class Way:
     light: str = "sampled"
     part: int = 0
     blur: float = 1.0
-    soft: bool = False
+    smoothed: bool = False
 
     @property
     def walks(self) -> bool:
@@ -51,7 +55,7 @@ class Way:
         return self.model == PATH_TRACED
 
     @property
-    def halves(self) -> tuple[Way, ...]:
+    def halves(self) -> tuple[Technique, ...]:
         """What it is measured by: itself, or two independent parts of gathered light."""
         return (replace(self, part=1), replace(self, part=2)) if self.light == GATHERED else (self,)
 
@@ -63,13 +67,13 @@ class Way:
 
     @property
     def flags(self) -> str:
-        """What asks the command `render` for it."""
+        """The options of the command `render` for it."""
         asked = f"--model {self.model}" + (f" --orders {self.orders}" if self.orders else "")
         return asked + (f" --light {GATHERED}" if self.light == GATHERED else "")
 
     @classmethod
-    def of(cls, name: str) -> Way:
-        """The way of that name; ValueError if there is none."""
+    def of(cls, name: str) -> Technique:
+        """The technique of that name; ValueError if there is none."""
         model, *more = name.split(", ")
         check_choice("way", model, (PATH_TRACED, *(m for m in model_names() if m != AUTO)))
         if model == PATH_TRACED and more:
@@ -80,38 +84,38 @@ class Way:
         return cls(model, "multiple" if NO_SINGLE in more else None, GATHERED if GATHERED in more else "sampled")
 
 
-WALKS = Way(PATH_TRACED)
+WALKS = Technique(PATH_TRACED)
 
 
-def ways() -> list[Way]:
+def techniques() -> list[Technique]:
     """All of them: path traced first, a diffuse surface, every model with light sampled and gathered, and those without
     the single scattering."""
     names = [name for name in model_names() if name not in (AUTO, LAMBERT)]
-    results = [WALKS, Way(LAMBERT), *map(Way, names), *(Way(name, light=GATHERED) for name in names)]
+    results = [WALKS, Technique(LAMBERT), *map(Technique, names), *(Technique(name, light=GATHERED) for name in names)]
     bare = [name for name in models() if model_class(name).orders == "multiple"]
-    return results + [Way(name, "multiple") for name in bare if name in ("better_dipole", "neural")]
+    return results + [Technique(name, "multiple") for name in bare if name in ("better_dipole", "neural")]
 
 
 @dataclass(eq=False)
 class Stage:
-    """A loaded scene, and the integrators that show it in several ways.
+    """A loaded scene, and the integrators of several techniques for it.
 
     Args:
         scene: the Mitsuba scene.
         shapes: its translucent shapes.
         settings: of its integrator, by parameter name.
         bssrdf: parameters that `bssrdf` alone understands.
-        paces: what an earlier look found by (object, way), by which the next one need not feel its way.
-        soft: light by which biases are told; None where the light of the scene tells them.
+        paces: first samples of earlier runs by (object, technique), so that the next run knows what a sample takes.
+        smoothed: environment by which biases are told; None where the light of the scene tells them.
     """
 
-    scene: Any
-    shapes: list[Any]
+    scene: mi.Scene
+    shapes: list[mi.Shape]
     settings: dict[str, Any]
     bssrdf: dict[str, Any]
-    paces: dict[tuple[int, Way], Any] = field(default_factory=dict)
-    soft: SoftLight | None = None
-    _integrators: dict[Way, Any] = field(default_factory=dict)
+    paces: dict[tuple[int, Technique], Sampled] = field(default_factory=dict)
+    smoothed: SmoothedEnvironment | None = None
+    _integrators: dict[Technique, mi.Integrator] = field(default_factory=dict)
 
     @property
     def mm_per_unit(self) -> float:
@@ -128,52 +132,54 @@ class Stage:
         return any(map(is_delta, self.scene.emitters()))
 
     @contextmanager
-    def softened(self) -> Iterator[Stage]:
-        """The same with soft light beside its own, if it has an environment map; its own is put back at the end."""
-        soft = SoftLight.of(self.scene)
+    def with_smoothed_environment(self) -> Iterator[Stage]:
+        """The stage with its environment map smoothed too, if it has one; its own is put back at the end."""
+        smoothed = SmoothedEnvironment.of(self.scene)
         try:
-            yield replace(self, soft=soft)
+            yield replace(self, smoothed=smoothed)
         finally:
-            if soft is not None:
-                soft.show(False)
+            if smoothed is not None:
+                smoothed.show(False)
 
-    def looks(self, way: Way) -> tuple[Way, ...]:
-        """What a way is measured by: its halves, or in soft light for the bias and one half for what it costs."""
-        if self.soft is None:
-            return way.halves
-        *rest, last = (replace(half, soft=True) for half in way.halves)
-        return (*rest, way.halves[-1], last)
+    def runs(self, technique: Technique) -> tuple[Technique, ...]:
+        """What a technique is measured by: its halves; smoothed for the bias, with one half unsmoothed for the cost."""
+        if self.smoothed is None:
+            return technique.halves
+        *rest, last = (replace(half, smoothed=True) for half in technique.halves)
+        return (*rest, technique.halves[-1], last)
 
-    def lit(self, way: Way) -> Any:
-        """The scene in the light that a way is looked at in."""
-        if self.soft is not None:
-            self.soft.show(way.soft)
+    def lit(self, technique: Technique) -> mi.Scene:
+        """The scene in the light of a run."""
+        if self.smoothed is not None:
+            self.smoothed.show(technique.smoothed)
         return self.scene
 
-    def integrator(self, way: Way) -> Any:
-        """The integrator of a way, which keeps what it has made ready; shapes are the same in all light."""
-        way = replace(way, soft=False)
-        if way not in self._integrators:
-            if way.walks:
-                plugin = {"type": "translucent_walk", **self.settings, "blur": way.blur, "light": "sampled"}
+    def integrator(self, technique: Technique) -> mi.Integrator:
+        """The integrator of a technique, which keeps what it has made ready; shapes are the same in all light."""
+        technique = replace(technique, smoothed=False)
+        if technique not in self._integrators:
+            if technique.walks:
+                plugin = {"type": "translucent_walk", **self.settings, "blur": technique.blur, "light": "sampled"}
             else:
-                plugin = {"type": "bssrdf", **self.settings, **self.bssrdf, "model": way.model, "light": way.light}
-                plugin |= {"orders": way.orders} if way.orders else {}
-            self._integrators[way] = mi.load_dict(plugin)
-            if way.part:
-                self._integrators[way].gathering = Gathering(way.part)
-            sampled = self._integrators.get(replace(way, light="sampled", part=0))
-            if way.light == GATHERED and sampled is not None and not mi.is_spectral:  # which refuses gathered light
-                self._integrators[way].take_over(sampled)
-        return self._integrators[way]
+                plugin = {"type": "bssrdf", **self.settings, **self.bssrdf}
+                plugin |= {"model": technique.model, "light": technique.light}
+                plugin |= {"orders": technique.orders} if technique.orders else {}
+            self._integrators[technique] = mi.load_dict(plugin)
+            if technique.part:
+                self._integrators[technique].gathering = Gathering(technique.part)
+            sampled = self._integrators.get(replace(technique, light="sampled", part=0))
+            # spectral variants refuse gathered light
+            if technique.light == GATHERED and sampled is not None and not mi.is_spectral:
+                self._integrators[technique].take_over(sampled)
+        return self._integrators[technique]
 
-    def forget(self, way: Way) -> None:
-        """What has been made ready for a way."""
-        self._integrators.pop(way, None)
+    def forget(self, technique: Technique) -> None:
+        """Drop what has been made ready for a technique."""
+        self._integrators.pop(technique, None)
 
 
-def stage(scene: Any, parameters: dict[str, str] | None = None) -> Stage:
-    """A scene made ready to be shown in several ways.
+def stage(scene: mi.Scene | dict[str, Any] | str | Path, parameters: dict[str, str] | None = None) -> Stage:
+    """A scene made ready to be rendered by several techniques.
 
     Args:
         scene: a Mitsuba scene, a dict, or the path of an XML file.
@@ -197,7 +203,7 @@ def stage(scene: Any, parameters: dict[str, str] | None = None) -> Stage:
     return Stage(loaded, shapes, *_settings(loaded))
 
 
-def _settings(scene: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+def _settings(scene: mi.Scene) -> tuple[dict[str, Any], dict[str, Any]]:
     """What both integrators are told, and `bssrdf` alone; what the scene says, where its integrator is one of them."""
     integrator = scene.integrator()
     if is_bssrdf(integrator):
