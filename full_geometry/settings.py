@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from halfspace_sss.checks import check_choice, check_interval
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 AUTOMATIC = -1.0
 ORDERS = ("total", "multiple", "single")
@@ -81,7 +84,7 @@ class Settings:
         return given | ({"orders": self.orders} if self.orders else {})
 
 
-def read_settings(props: Any) -> Settings:
+def read_settings(props: mi.Properties) -> Settings:
     """Settings from the parameters of the plugin; ValueError if one is unknown or out of range."""
     check_parameters("bssrdf", props, (*Settings.__dataclass_fields__, *OF_MITSUBA))
     given = {key: props[key] for key in Settings.__dataclass_fields__ if key in props}
@@ -117,7 +120,7 @@ def variant_channels() -> int:
 OF_MITSUBA = ("block_size", "samples_per_pass", "timeout")  # of its `SamplingIntegrator`; launches are ours
 
 
-def check_parameters(plugin: str, props: Any, known: Collection[str]) -> None:
+def check_parameters(plugin: str, props: mi.Properties, known: Collection[str]) -> None:
     """ValueError names the first parameter of a plugin that it does not know."""
     for key in props.keys():
         check_choice(f"parameter of {plugin}", key, known)

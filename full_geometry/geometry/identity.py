@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import re
 import sys
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -21,7 +20,7 @@ _LEFT_OUT = re.compile(
 )
 
 
-def scene_hash(scene: Any, integrator: Any) -> str:
+def scene_hash(scene: mi.Scene, integrator: mi.Integrator) -> str:
     """SHA-256 of the objects of a scene, in words and by all their parameters, and of the integrator that renders it.
 
     The integrator of the scene itself, ids, the order of objects and the number of samples of a sampler are left out.
@@ -32,15 +31,15 @@ def scene_hash(scene: Any, integrator: Any) -> str:
     return hashlib.sha256("\n".join([*result, words(integrator)]).encode()).hexdigest()
 
 
-def children(holder: Any) -> list[Any]:
+def children(holder: mi.Object) -> list[mi.Object]:
     """The objects that stand in a scene or in another object, in any order."""
 
     class Children(mi.TraversalCallback):
         def __init__(self) -> None:
             mi.TraversalCallback.__init__(self)
-            self.found: list[Any] = []
+            self.found: list[mi.Object] = []
 
-        def put(self, name: str, value: Any, flags: Any, cpptype: Any = None) -> None:
+        def put(self, name: str, value: object, flags: object, cpptype: object = None) -> None:
             if isinstance(value, mi.Object):
                 self.found.append(value)
 
@@ -59,12 +58,12 @@ def object_digest(node: mi.Object) -> str:
     return digest.hexdigest()
 
 
-def words(result: Any) -> str:
+def words(result: object) -> str:
     """What an object tells of itself, to the last digit where Python prints it."""
     with np.printoptions(precision=17, threshold=sys.maxsize):
         return _LEFT_OUT.sub("", _MADE_UP.sub("", str(result)))
 
 
-def _content(value: Any) -> bytes:
+def _content(value: object) -> bytes:
     numbers = np.array(plain(value))
     return str(value).encode() if numbers.dtype == object else str(numbers.shape).encode() + numbers.tobytes()

@@ -21,7 +21,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.geometry.points import TransportAround
+from full_geometry.geometry.points import EntrySample, ObjectAlbedo, Proposals, SurfacePoint, TransportAround
 from full_geometry.geometry.rounding import EPSILON, OF_WAY, bound_of, bounds, place_bound, ray_to
 from full_geometry.geometry.shape import (
     by_pointer,
@@ -213,14 +213,14 @@ class InstanceTransform(NamedTuple):
         local.o, local.d = self.point_to_object(ray.o), mi.Vector3f(_map(self.to_object, ray.d))
         return local
 
-    def surface_point_to_object(self, at: Any) -> Any:
+    def surface_point_to_object(self, at: SurfacePoint) -> SurfacePoint:
         """A `points.SurfacePoint` in the frame of the group."""
         w = mi.Vector3f(dr.normalize(_map(self.to_object, at.w)))
         return at._replace(
             p=self.point_to_object(at.p), n=self.normal_to_object(at.n), n_out=self.normal_to_object(at.n_out), w=w
         )
 
-    def entry_to_world(self, entry: Any) -> Any:
+    def entry_to_world(self, entry: EntrySample) -> EntrySample:
         """A `points.EntrySample` of the frame of the group in the scene: dA = |det M| |M^-T n'| dA'."""
         n, n_out = (_transposed(self.to_object, each) for each in (entry.n, entry.n_out))
         x, y, z, shift = self.to_world
@@ -263,7 +263,7 @@ class InstanceScene:
     """
 
     shapes: list[mi.Shape]
-    tables: dict[str, Any]
+    tables: dict[str, mi.Float | mi.Int32 | mi.UInt32 | list[mi.Vector3f]]
     bounds: mi.Float | None = None
     lamps: mi.Float | None = None
 
@@ -411,24 +411,26 @@ class InstanceProposals:
         transform: of the instance.
     """
 
-    proposals: Any
+    proposals: Proposals
     transform: InstanceTransform
 
-    def prepare(self, out: Any, prepared: Any, active: mi.Bool) -> Any:
+    def prepare(self, out: SurfacePoint, prepared: Any, active: mi.Bool) -> Any:
         """As of the proposals."""
         return self.proposals.prepare(self.transform.surface_point_to_object(out), prepared, active)
 
-    def sample(self, out: Any, prim_index: mi.UInt32, prepared: Any, sampler: mi.Sampler, active: mi.Bool) -> Any:
+    def sample(
+        self, out: SurfacePoint, prim_index: mi.UInt32, prepared: Any, sampler: mi.Sampler, active: mi.Bool
+    ) -> EntrySample:
         """As of the proposals."""
         return self.transform.entry_to_world(
             self.proposals.sample(self.transform.surface_point_to_object(out), prim_index, prepared, sampler, active)
         )
 
-    def sample_direction(self, entry: Any, out: Any, u: mi.Point2f) -> tuple[Any, Any]:
+    def sample_direction(self, entry: EntrySample, out: SurfacePoint, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
         """As of the proposals, which ask for both ends alone."""
         return self.proposals.sample_direction(entry, out, u)
 
-    def pdf_direction(self, entry: Any, out: Any, w_i: mi.Vector3f) -> Any:
+    def pdf_direction(self, entry: EntrySample, out: SurfacePoint, w_i: mi.Vector3f) -> mi.Float:
         """As of the proposals."""
         return self.proposals.pdf_direction(entry, out, w_i)
 
@@ -447,11 +449,11 @@ class InstanceTransport(TransportAround):
     def alpha(self) -> InstanceAlbedo | None:
         return None if self.transport.alpha is None else InstanceAlbedo(self.transport.alpha, self.transform)
 
-    def prepare(self, at: Any, active: mi.Bool = True) -> Any:
+    def prepare(self, at: SurfacePoint, active: mi.Bool = True) -> Any:
         """As of the transport."""
         return self.transport.prepare(self.transform.surface_point_to_object(at), active)
 
-    def S(self, exit: Any, at: Any, active: mi.Bool = True) -> mi.Spectrum:
+    def S(self, exit: Any, at: SurfacePoint, active: mi.Bool = True) -> mi.Spectrum:
         """As of the transport."""
         return self.transport.S(exit, self.transform.surface_point_to_object(at), active)
 
@@ -460,13 +462,13 @@ class InstanceTransport(TransportAround):
 class InstanceAlbedo:
     """`points.ObjectAlbedo` of a learnt object in the frame of the group."""
 
-    alpha: Any
+    alpha: ObjectAlbedo
     transform: InstanceTransform
 
     @property
     def known(self) -> tuple[mi.Spectrum, mi.Spectrum]:
         return self.alpha.known
 
-    def __call__(self, at: Any, active: mi.Bool) -> tuple[mi.Spectrum, mi.Spectrum]:
+    def __call__(self, at: SurfacePoint, active: mi.Bool) -> tuple[mi.Spectrum, mi.Spectrum]:
         """As of the shape."""
         return self.alpha(self.transform.surface_point_to_object(at), active)

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from copy import copy
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -28,6 +28,27 @@ import numpy as np
 from full_geometry.geometry import mesh
 from full_geometry.geometry.rounding import ray_from
 from full_geometry.geometry.shape import Geometry
+
+if TYPE_CHECKING:
+    from halfspace_sss.interface.model import BSSRDF
+
+
+@dataclass
+class MediumAt:
+    """The medium at a point of a surface, per channel, for the whole way of light from there; 1/(scene unit).
+
+    Args:
+        albedo: of single scattering.
+        sigma_t: extinction.
+        face: number of the face there.
+        g, wavelengths: mean cosine and wavelengths in nm, under spectral variants.
+    """
+
+    albedo: mi.Spectrum
+    sigma_t: mi.Spectrum
+    face: mi.UInt32
+    g: mi.Spectrum | tuple[()] = ()
+    wavelengths: mi.Spectrum | tuple[()] = ()
 
 
 class SurfacePoint(NamedTuple):
@@ -39,7 +60,7 @@ class SurfacePoint(NamedTuple):
         n_out: outward shading normal, as w sees it: see `lifted`.
         w: direction.
         sign: that turns geometric normals of the shape outwards.
-        medium: at the point, a `MediumAt` in 1/(scene unit), of objects with textures.
+        medium: at the point, of objects with textures or spectra.
     """
 
     p: mi.Point3f
@@ -47,7 +68,7 @@ class SurfacePoint(NamedTuple):
     n_out: mi.Normal3f
     w: mi.Vector3f
     sign: mi.Float | float = 1.0
-    medium: Any = ()
+    medium: MediumAt | tuple[()] = ()
 
     @property
     def mu(self) -> mi.Float:
@@ -98,26 +119,26 @@ def refract_in(at: SurfacePoint, eta: mi.Float | float) -> tuple[mi.Vector3f, mi
 class Frame(NamedTuple):
     """Tangents and normal at a point; `t` follows x_i -> x_o."""
 
-    t: Any
-    b: Any
-    n: Any
+    t: mi.Vector3f
+    b: mi.Vector3f
+    n: mi.Normal3f
 
-    def azimuth(self, w: mi.Vector3f) -> Any:
+    def azimuth(self, w: mi.Vector3f) -> mi.Float:
         """Azimuth of w about the normal from t, radians."""
         return dr.atan2(dr.dot(w, self.b), dr.dot(w, self.t))
 
-    def direction(self, mu: mi.Float, phi: mi.Float) -> Any:
+    def direction(self, mu: mi.Float, phi: mi.Float) -> mi.Vector3f:
         """The unit vector with cosine mu and azimuth phi."""
         sine, (s, c) = dr.safe_sqrt((1 - mu) * (1 + mu)), dr.sincos(phi)
         return self.t * (sine * c) + self.b * (sine * s) + self.n * mu
 
 
-def opaque(value: float) -> Any:
+def opaque(value: float) -> mi.Float:
     """A number of a scene as data of a kernel, which then serves other materials and sizes too."""
     return dr.opaque(mi.Float, float(value))
 
 
-def channel_mean(value: Any) -> Any:
+def channel_mean(value: mi.Spectrum) -> mi.Float:
     """Mean over the channels of a colour.
 
     By `drjit.mean` the number of lanes is part of a kernel, which is then compiled anew for every size of an image.
@@ -125,7 +146,7 @@ def channel_mean(value: Any) -> Any:
     return dr.sum(value) / len(value)
 
 
-def place(p: mi.Point3f, n: mi.Normal3f, medium: Any = ()) -> Any:
+def place(p: mi.Point3f, n: mi.Normal3f, medium: MediumAt | tuple[()] = ()) -> mi.Interaction3f:
     """A point with its geometric normal.
 
     Under spectral variants with the wavelengths of a `medium`: emitters are asked for those.
@@ -147,7 +168,7 @@ def local_frame(n: mi.Normal3f, d: mi.Vector3f) -> Frame:
     return Frame(t, dr.cross(n, t), n)
 
 
-def separation(p_i: mi.Point3f, n_i: mi.Normal3f, p_o: mi.Point3f, n_o: mi.Normal3f, geometry: str) -> Any:
+def separation(p_i: mi.Point3f, n_i: mi.Normal3f, p_o: mi.Point3f, n_o: mi.Normal3f, geometry: str) -> mi.Float:
     """Distance r of the half-space query, in scene units.
 
     "distance" takes |d|, d = x_o - x_i. "tangent" takes sqrt(d² - c (d.n)²), n along n_i + n_o and c = max(n_i.n_o, 0):
@@ -191,18 +212,18 @@ def plane_query(at: SurfacePoint, out: SurfacePoint, geometry: str) -> tuple[mi.
 # What is reflected to below the surface is reflected once more, at the surface.
 
 
-def turned(n_shading: mi.Normal3f, n: mi.Normal3f) -> Any:
+def turned(n_shading: mi.Normal3f, n: mi.Normal3f) -> mi.Normal3f:
     """The shading normal on the side of the geometric one: vertex normals need not agree with the winding of a face."""
     return dr.select(dr.dot(n_shading, n) < 0, -n_shading, n_shading)
 
 
-def lifted(m: mi.Normal3f, n: mi.Normal3f, w: mi.Vector3f) -> Any:
+def lifted(m: mi.Normal3f, n: mi.Normal3f, w: mi.Vector3f) -> mi.Normal3f:
     """The interpolated normal m that w sees, on the side of w that the geometric normal n is on."""
     c = dr.dot(m, w)
     return mi.Normal3f(dr.select(c * dr.dot(n, w) < 0, m - 2 * c * w, m))
 
 
-def lift(si: mi.SurfaceInteraction3f, w: mi.Vector3f, active: mi.Bool = True) -> Any:
+def lift(si: mi.SurfaceInteraction3f, w: mi.Vector3f, active: mi.Bool = True) -> mi.SurfaceInteraction3f:
     """The interaction with the frame that w sees, a direction in the world that becomes its `wi`."""
     c = dr.dot(si.sh_frame.n, w)
     below = active & (c * dr.dot(si.n, w) < 0)
@@ -212,17 +233,17 @@ def lift(si: mi.SurfaceInteraction3f, w: mi.Vector3f, active: mi.Bool = True) ->
     return si
 
 
-def opposed(w: mi.Vector3f, n: mi.Normal3f) -> Any:
+def opposed(w: mi.Vector3f, n: mi.Normal3f) -> mi.Vector3f:
     """w, or -w where that is the one above the surface of the normal n."""
     return dr.select(dr.dot(w, n) < 0, -w, w)
 
 
-def mirrored(w: mi.Vector3f, n: mi.Normal3f) -> Any:
+def mirrored(w: mi.Vector3f, n: mi.Normal3f) -> mi.Vector3f:
     """w, mirrored at the surface of the normal n where it is below."""
     return w - n * (2 * dr.minimum(dr.dot(w, n), 0))
 
 
-def sided(si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> tuple[Any, Any]:
+def sided(si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> tuple[mi.Vector3f, mi.Bool]:
     """A direction of a boundary in the world, on the side of the surface that it has in the frame; if it was turned."""
     d = si.to_world(wo)
     side = dr.select(wo.z > 0, 1.0, -1.0)
@@ -232,7 +253,7 @@ def sided(si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> tuple[Any, Any]:
     return mi.Vector3f(dr.select(wrong, dr.select(reflects, mirrored(d, n), -d), d)), wrong & reflects
 
 
-def cosine_above(m: mi.Normal3f, n: mi.Normal3f, u: mi.Point2f) -> tuple[Any, Any]:
+def cosine_above(m: mi.Normal3f, n: mi.Normal3f, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
     """A direction above the surface by the cosine to m, for a pair of uniforms, and its density |m.w| / pi."""
     w = opposed(mi.Frame3f(m).to_world(mi.warp.square_to_cosine_hemisphere(u)), n)
     return mi.Vector3f(w), cosine_density(m, n, w)
@@ -243,7 +264,7 @@ def cosine_direction(n_out: mi.Normal3f, n: mi.Normal3f, rng: mi.PCG32) -> mi.Ve
     return cosine_above(n_out, n, mi.Point2f(rng.next_float32(), rng.next_float32()))[0]
 
 
-def cosine_density(m: mi.Normal3f, n: mi.Normal3f, w: mi.Vector3f) -> Any:
+def cosine_density(m: mi.Normal3f, n: mi.Normal3f, w: mi.Vector3f) -> mi.Float:
     """The density of `cosine_above`, 1/sr; 0 below the surface."""
     return dr.select(dr.dot(w, n) > 0, dr.abs(dr.dot(w, m)) * dr.inv_pi, 0)
 
@@ -271,7 +292,7 @@ class EntrySample(NamedTuple):
     n_out: mi.Normal3f
     weight: mi.Float
     face: mi.UInt32
-    medium: Any = ()
+    medium: MediumAt | tuple[()] = ()
 
     def gather(self, k: mi.UInt32) -> EntrySample:
         """The entries of the lanes k."""
@@ -297,23 +318,23 @@ class Proposals(Protocol):
     ) -> EntrySample:
         """A point of entry; its weight is the inverse of the density of such points over the surface, (scene unit)²."""
 
-    def sample_direction(self, entry: EntrySample, out: SurfacePoint, u: mi.Point2f) -> tuple[Any, Any]:
+    def sample_direction(self, entry: EntrySample, out: SurfacePoint, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
         """A direction w_i that points away from the surface at the entry, for a pair of uniforms, and its density.
 
         The density is over solid angle, 1/sr.
         """
 
-    def pdf_direction(self, entry: EntrySample, out: SurfacePoint, w_i: mi.Vector3f) -> Any:
+    def pdf_direction(self, entry: EntrySample, out: SurfacePoint, w_i: mi.Vector3f) -> mi.Float:
         """The density of `sample_direction`, 1/sr; 0 below the surface."""
 
 
 class CosineProposals(Proposals, Protocol):
     """Proposals whose directions are by the cosine to the interpolated normal, above the surface."""
 
-    def sample_direction(self, entry: EntrySample, out: SurfacePoint, u: mi.Point2f) -> tuple[Any, Any]:
+    def sample_direction(self, entry: EntrySample, out: SurfacePoint, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
         return cosine_above(entry.n_out, entry.n, u)
 
-    def pdf_direction(self, entry: EntrySample, out: SurfacePoint, w_i: mi.Vector3f) -> Any:
+    def pdf_direction(self, entry: EntrySample, out: SurfacePoint, w_i: mi.Vector3f) -> mi.Float:
         return cosine_density(entry.n_out, entry.n, w_i)
 
 
@@ -431,7 +452,7 @@ class PositionSampler:
         """Number of probes."""
         return int(self.area_share < 1)
 
-    def _side(self, out: SurfacePoint, prim_index: mi.UInt32, active: mi.Bool) -> Any:
+    def _side(self, out: SurfacePoint, prim_index: mi.UInt32, active: mi.Bool) -> mi.Float:
         """What turns the normal of a face outwards: of a sheet, to the side of the exit."""
         return self.geometry.side(prim_index, active) if self.geometry.closed else out.sign
 
@@ -473,7 +494,7 @@ class PositionSampler:
         weight = dr.select(total > 0, total / dr.maximum(p, 1e-30), 0)
         return EntrySample(kept.p, turned(kept.n, kept.n_out), kept.n_out, weight, kept.face)
 
-    def _reach(self, across: mi.Float) -> Any:
+    def _reach(self, across: mi.Float) -> mi.Float:
         return REACH * across + opaque(LEAST_REACH * self.geometry.size + NEAR * self.table.mean)
 
     def _probe(
@@ -518,7 +539,7 @@ class PositionSampler:
     ) -> _Kept:
         """All hits of a probe as candidates."""
 
-        def step(ray: mi.Ray3f, left: Any, kept: tuple, active: mi.Bool) -> tuple:
+        def step(ray: mi.Ray3f, left: mi.UInt32, kept: tuple, active: mi.Bool) -> tuple:
             si = self.geometry.ray_intersect(ray, _FLAGS(), False, active)
             active &= si.is_valid() & (left > 0)
             same = self.geometry.piece(si.prim_index, active) == piece
@@ -545,7 +566,7 @@ class PositionSampler:
         """Points over the area as candidates."""
         m, inverse = opaque(float(self.area_points)), opaque(1 / self.area_points)
 
-        def step(k: Any, kept: tuple) -> tuple:
+        def step(k: mi.UInt32, kept: tuple) -> tuple:
             v = mi.Point2f(*(wrapped(x + k * ratio) for x, ratio in zip((u.x, u.y), LATTICE)))
             at = self.points.sample(wrapped(u_face + k * inverse), v, active)
             same = self.geometry.piece(at.prim_index, active) == piece
@@ -560,12 +581,12 @@ class PositionSampler:
 class _Kept(NamedTuple):
     """The candidate that is kept: uniform number left, sum of h so far, point, normals, face."""
 
-    u: Any
-    total: Any
-    p: Any
-    n: Any
-    n_out: Any
-    face: Any
+    u: mi.Float
+    total: mi.Float
+    p: mi.Point3f
+    n: mi.Normal3f
+    n_out: mi.Normal3f
+    face: mi.UInt32
 
 
 def wrapped(u: mi.Float) -> mi.Float:
@@ -588,10 +609,10 @@ def _nowhere() -> tuple:
 class Point(NamedTuple):
     """Position, geometric normal, shading normal (as the shape has them) and face of a point."""
 
-    p: Any
-    n: Any
-    n_shading: Any
-    prim_index: Any
+    p: mi.Point3f
+    n: mi.Normal3f
+    n_shading: mi.Normal3f
+    prim_index: mi.UInt32
 
 
 class AreaPoints:
@@ -619,7 +640,7 @@ class AreaPoints:
         result.faces = mi.DiscreteDistribution(mi.Float((self.areas * brightness).astype(np.float32)))
         return result
 
-    def brightness(self, face: mi.UInt32) -> Any:
+    def brightness(self, face: mi.UInt32) -> mi.Float | float:
         """Density of points over that of uniform ones, on a face."""
         return 1.0 if self.light is None else dr.gather(mi.Float, self.light, face)
 
@@ -631,7 +652,7 @@ class AreaPoints:
             return Point(ps.p, n, n, mi.UInt32(0))
         return self.on_face(self.faces.sample(u_face, active), u, active)
 
-    def _radial(self, p: mi.Point3f) -> Any:
+    def _radial(self, p: mi.Point3f) -> mi.Normal3f:
         n = dr.normalize(p - mi.Point3f(*(opaque(c) for c in self.centre)))
         return mi.Normal3f(-n if mesh.is_flipped(self.shape) else n)
 
@@ -668,7 +689,7 @@ class RadialTable:
         reach: largest distance, scene units.
     """
 
-    def __init__(self, models: list[Any], reach: float) -> None:
+    def __init__(self, models: list[BSSRDF], reach: float) -> None:
         densest = max(float(m.medium.sigma_t) for m in models)
         r_min = min(SHORTEST / densest, 1e-3 * reach)
         edges = np.concatenate([[0.0], np.geomspace(r_min, reach, N_CELLS)])
@@ -682,16 +703,16 @@ class RadialTable:
         self.per_log = (N_CELLS - 1) / math.log(reach / r_min)
         self.mean = float(np.sum(probability * middle))
         self._numpy = (np.cumsum(probability), probability, edges, probability / (2 * math.pi * np.diff(edges)))
-        self._lanes: dict[str, Any] = {}
+        self._lanes: dict[str, tuple[mi.Float, ...]] = {}
 
-    def _arrays(self) -> tuple[Any, ...]:
+    def _arrays(self) -> tuple[mi.Float, ...]:
         if mi.variant() not in self._lanes:
             numbers = (opaque(v) for v in (self.r_min, self.per_log, self.reach))
             self._lanes[mi.variant()] = (*(mi.Float(v.astype(np.float32)) for v in self._numpy), *numbers)
             dr.eval(self._lanes[mi.variant()])
         return self._lanes[mi.variant()]
 
-    def sample(self, u: mi.Float) -> Any:
+    def sample(self, u: mi.Float) -> mi.Float:
         """Distance r for uniform u in [0, 1)."""
         cdf, probability, edges, *_ = self._arrays()
         k = dr.binary_search(0, N_CELLS - 1, lambda i: dr.gather(mi.Float, cdf, i) <= u)
@@ -699,7 +720,7 @@ class RadialTable:
         low, high = dr.gather(mi.Float, edges, k), dr.gather(mi.Float, edges, k + 1)
         return dr.lerp(low, high, dr.clip(share, 0, 1))
 
-    def pdf(self, r: mi.Float) -> Any:
+    def pdf(self, r: mi.Float) -> mi.Float:
         """Density over the plane at distance r, 1/(scene unit)²; 0 beyond the reach."""
         *_, times_r, r_min, per_log, reach = self._arrays()
         steps = dr.log(dr.maximum(r, r_min) / r_min) * per_log

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -16,6 +16,9 @@ from scipy.sparse.csgraph import connected_components
 from full_geometry.geometry import mesh
 from full_geometry.geometry.rounding import bound_of, ray_from
 from full_geometry.geometry.snapshot import Snapshot
+
+if TYPE_CHECKING:
+    from full_geometry.geometry.instances import Group, InstanceTransform
 
 MOST_COPIES = 1e-3  # share of the area in faces that exist twice, by which light may then be wrong
 CREASES = 0.01  # of the corners whose vertex normal may be on the other side of the face, as at sharp edges
@@ -163,6 +166,7 @@ def _turned(n: int, first: np.ndarray, second: np.ndarray, same: np.ndarray, nam
 
 RAYS = 4096  # of `analyse_shape`
 MOST_HITS = 64  # that one ray counts
+Pointer = "mi.ShapePtr | mi.EmitterPtr | mi.BSDFPtr"  # of Dr.Jit's registry
 MAJORITY = 0.75  # of the first hits from outside agree on the side of the normals, unless the object is a sheet
 
 
@@ -188,19 +192,19 @@ class Geometry:
         lost: share of the rays that enter it and do not leave again.
     """
 
-    shape: Any
-    scene: Any
+    shape: mi.Shape
+    scene: mi.Scene
     sign: float
-    signs: Any
+    signs: mi.Float | None
     agree: bool
     closed: bool
-    pieces: Any
+    pieces: mi.UInt32 | None
     size: float
     area: float
     state: Snapshot
     inclusions: Any = None
-    group: Any = None
-    transform: Any = None
+    group: Group | None = None
+    transform: InstanceTransform | None = None
     lost: float = 0.0
 
     @property
@@ -213,7 +217,7 @@ class Geometry:
         same = geometry_of(self.shape) == self.state
         return same and (self.inclusions is None or self.inclusions.is_current())
 
-    def piece(self, prim_index: mi.UInt32, active: mi.Bool) -> Any:
+    def piece(self, prim_index: mi.UInt32, active: mi.Bool) -> mi.UInt32:
         """The number of the piece that a face belongs to."""
         if self.pieces is None:
             return mi.UInt32(0)
@@ -229,7 +233,7 @@ class Geometry:
         """`rounding` as data of kernels; of an instance where that stands."""
         return dr.opaque(mi.Float, self.rounding) if self.transform is None else self.transform.rounding
 
-    def as_instance(self, transform: Any) -> Geometry:
+    def as_instance(self, transform: InstanceTransform | None) -> Geometry:
         """The geometry of one instance; its size is that of the largest."""
         return replace(self, transform=transform, size=self.size * self.group.longest)
 
@@ -262,14 +266,14 @@ class Geometry:
         """-1 for a mesh with flip_normals, whose normals Mitsuba turns, but not their derivatives."""
         return -1.0 if self.shape.is_mesh() and mesh.is_flipped(self.shape) else 1.0
 
-    def side(self, prim_index: mi.UInt32, active: mi.Bool = True) -> Any:
+    def side(self, prim_index: mi.UInt32, active: mi.Bool = True) -> mi.Float:
         """1 where the geometric normal of a face points outwards, -1 where it points inwards."""
         if self.signs is None:
             return mi.Float(self.sign)
         return dr.gather(mi.Float, self.signs, prim_index, active)
 
 
-def analyse_shape(shape: mi.Shape, world: mi.Scene | None = None, groups: Iterable[Any] = ()) -> Geometry:
+def analyse_shape(shape: mi.Shape, world: mi.Scene | None = None, groups: Iterable[Group] = ()) -> Geometry:
     """Find by rays from outside which side of a shape is out; warns if it is open or its faces point to both sides.
 
     A mesh is closed if its edges say so. Rays decide for others, and where edges of faces that touch do not match.
@@ -374,7 +378,7 @@ class _Votes:
         shares = self._shares()
         return len(shares) > 0 and bool((np.abs(shares - 0.5) >= MAJORITY - 0.5).all())
 
-    def signs(self) -> Any:
+    def signs(self) -> mi.Float | None:
         """Of each face, or None if all pieces have the same."""
         if self.pieces is None:
             return None
@@ -391,10 +395,10 @@ def _outside_view(scene: mi.Scene, votes: _Votes) -> tuple[np.ndarray, float]:
     return side, float((count[hit] % 2).mean()) if hit.any() else 0.0
 
 
-def crossings(scene: mi.Scene, ray: mi.Ray3f, votes: _Votes | None = None) -> tuple[Any, Any]:
+def crossings(scene: mi.Scene, ray: mi.Ray3f, votes: _Votes | None = None) -> tuple[mi.Float, mi.UInt32]:
     """Side of the first hit of each ray (1: the normal points to the ray, 0: no hit) and the number of hits."""
 
-    def step(ray: mi.Ray3f, side: Any, count: Any, active: mi.Bool) -> tuple:
+    def step(ray: mi.Ray3f, side: mi.Float, count: mi.UInt32, active: mi.Bool) -> tuple:
         si = meet_alone(scene, ray, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active)
         active &= si.is_valid()
         first = dr.select(dr.dot(si.n, ray.d) < 0, 1.0, -1.0)
@@ -440,7 +444,7 @@ def completed(
 FEW, MANY = 3, 65  # rays from a point, which decide where they agree, and where they do not
 
 
-def is_inside(geometry: Geometry, points: Any) -> np.ndarray:
+def is_inside(geometry: Geometry, points: np.ndarray) -> np.ndarray:
     """Which points (array of shape (3, n)) lie inside a closed object, by the parity of the hits of rays from them."""
     points, box = np.asarray(points, dtype=float), geometry.scene.bbox()
     result = np.zeros(points.shape[1], dtype=bool)
@@ -487,7 +491,7 @@ def _by_optix() -> bool:
     return mi.variant().startswith("cuda")
 
 
-def by_pointer(pointers: list[Any], values: np.ndarray, otherwise: int) -> mi.Int32:
+def by_pointer(pointers: list[Pointer], values: np.ndarray, otherwise: int) -> mi.Int32:
     """Table from the number of a pointer in Dr.Jit's registry to a value."""
     ids = pointer_numbers(pointers)
     table = np.full(max(ids, default=0) + 1, otherwise, dtype=np.int32)
@@ -495,12 +499,12 @@ def by_pointer(pointers: list[Any], values: np.ndarray, otherwise: int) -> mi.In
     return mi.Int32(table.tolist())  # lists, not NumPy arrays: memory in any alignment would need kernels of its own
 
 
-def pointer_numbers(pointers: Iterable[Any]) -> list[int]:
+def pointer_numbers(pointers: Iterable[Pointer]) -> list[int]:
     """What Dr.Jit's registry calls each."""
     return [int(dr.reinterpret_array(mi.UInt32, pointer)[0]) for pointer in pointers]
 
 
-def looked_up(table: mi.Int32, pointer: Any, otherwise: int, active: Any = True) -> mi.Int32:
+def looked_up(table: mi.Int32, pointer: Pointer, otherwise: int, active: mi.Bool | bool = True) -> mi.Int32:
     """The value of a pointer in a table of `by_pointer`."""
     number = dr.reinterpret_array(mi.UInt32, pointer)
     known = active & (number < dr.width(table))
@@ -525,7 +529,7 @@ class SceneMark:
         return dr.detail.collect_indices(self._kept) == dr.detail.collect_indices(other._kept)
 
 
-def scene_of(shapes: list[Any], world: mi.Scene | None = None) -> Any:
+def scene_of(shapes: list[mi.Shape], world: mi.Scene | None = None) -> mi.Scene:
     """A Mitsuba scene that holds these shapes, which keep their ids.
 
     Args:
@@ -553,7 +557,7 @@ def groups_of(scene: mi.Scene) -> list[mi.Shape]:
     return [node for node in mi.traverse(scene).hierarchy if node.class_name() == "ShapeGroupPlugin"]
 
 
-def rays_into(box: mi.ScalarBoundingBox3f, n: int) -> Any:
+def rays_into(box: mi.ScalarBoundingBox3f, n: int) -> mi.Ray3f:
     """Rays from about a bounding box to places in it."""
     ends = (np.array(end, dtype=float).reshape(1, 3) for end in (box.min, box.max))
     (start,), (along,) = ways_into(*ends, n)
@@ -572,7 +576,7 @@ def ways_into(low: np.ndarray, high: np.ndarray, n: int) -> tuple[np.ndarray, np
     return start, along / np.linalg.norm(along, axis=1, keepdims=True)
 
 
-def lines_through(box: mi.ScalarBoundingBox3f, n: int) -> Any:
+def lines_through(box: mi.ScalarBoundingBox3f, n: int) -> mi.Ray3f:
     """Rays along lines through the ball about a bounding box that are uniform over places and directions."""
     rng, (low, high) = np.random.default_rng(7), (np.array(end, dtype=float) for end in (box.min, box.max))
     d, aside = rng.standard_normal((2, 3, n))
@@ -583,7 +587,7 @@ def lines_through(box: mi.ScalarBoundingBox3f, n: int) -> Any:
     return mi.Ray3f(mi.Point3f(start), mi.Vector3f(d))
 
 
-def check_together(world: mi.Scene, scenes: list[Any]) -> None:
+def check_together(world: mi.Scene, scenes: list[mi.Scene]) -> None:
     """Try rays in a scene and in those of objects in it by one kernel, where that may fail.
 
     Args:
@@ -614,7 +618,7 @@ def check_together(world: mi.Scene, scenes: list[Any]) -> None:
             )
 
 
-def _met(scene: mi.Scene, ray: mi.Ray3f) -> Any:
+def _met(scene: mi.Scene, ray: mi.Ray3f) -> mi.UInt32:
     """The numbers of the shapes that rays meet in Dr.Jit's registry, 0 for none."""
     hit = scene.ray_intersect_preliminary(ray, False)
     return dr.select(hit.is_valid(), dr.reinterpret_array(mi.UInt32, hit.shape), 0)

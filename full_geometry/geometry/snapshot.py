@@ -46,7 +46,7 @@ class Snapshot:
         return same_objects(self._nodes, other._nodes) and self._checksums == other._checksums
 
 
-def same_objects(a: list[Any], b: list[Any]) -> bool:
+def same_objects(a: list[mi.Object], b: list[mi.Object]) -> bool:
     """Whether two lists hold the same objects of Mitsuba."""
     return len(a) == len(b) and all(x is y for x, y in zip(a, b))
 
@@ -67,7 +67,7 @@ def _checksum(value: object) -> bytes:
     return result.digest()
 
 
-def _numbers(value: Any) -> Iterator[np.ndarray]:
+def _numbers(value: dr.ArrayBase | object) -> Iterator[np.ndarray]:
     """The numbers of a parameter, array by array: to join arrays Dr.Jit would run a kernel."""
     if dr.is_tensor_v(value):
         yield np.array(value.shape)

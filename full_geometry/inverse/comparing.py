@@ -51,6 +51,7 @@ FIRST = 4  # renders for the weights of a view that is met first
 NEWEST = 0.25  # share of the renders of a step in those for the weights of the next
 NEAR, FAR_OFF = 1, 3  # pixels: in NEAR noise may be alike, from there to FAR_OFF it is not
 CERTAIN = 4.0  # standard errors by which a chi-square is told to be a misfit
+Variables = Mapping[str, "mi.Float | mi.Spectrum"]  # by name
 
 
 @dataclass(frozen=True)
@@ -364,7 +365,7 @@ class ViewComparison:
         return hasattr(self.scene.integrator(), "render_derivatives")
 
     def sloped(
-        self, which: int, k: int, purpose: str, x: Mapping[str, Any], put: Callable[[Mapping[str, Any]], None],
+        self, which: int, k: int, purpose: str, x: Variables, put: Callable[[Variables], None],
         slopes: bool,
     ) -> tuple[np.ndarray, list[np.ndarray]]:  # fmt: skip
         """A render of a view in a step, and its derivatives by each variable, all of whose numbers change alike.
@@ -378,7 +379,7 @@ class ViewComparison:
         view, spp, integrator = self.views[which], self.settings.spp, self.scene.integrator()
         seed, found = self.seed(k, which, purpose), []
 
-        def followed(names: Iterable[str]) -> dict[str, Any]:
+        def followed(names: Iterable[str]) -> Variables:
             result = {name: type(value)(value) for name, value in x.items()}
             for name in names:
                 dr.enable_grad(result[name])
@@ -449,7 +450,7 @@ class FitDescent(Protocol):
         """Of what is fitted to what, how, and from where."""
 
 
-def kept_at(change: Any) -> Any:
+def kept_at(change: np.ndarray | float) -> np.ndarray | float:
     """Share that is kept of what was measured before a variable changed by so much."""
     return 1 / (1 + (change / FAR) ** 4)
 

@@ -26,7 +26,6 @@ import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -43,6 +42,7 @@ from full_geometry.inverse.comparing import (
     ChiSquare,
     FitStep,
     MaterialFit,
+    Variables,
     ViewComparison,
     ViewMisfit,
     arrays_of_means,
@@ -135,7 +135,7 @@ class Variable:
             return (v - low) * (high - v) / (high - low)
         return G - v**2 / G if self.name == "g" else v
 
-    def numbers(self, x: np.ndarray) -> Any:
+    def numbers(self, x: np.ndarray) -> mi.Float | mi.Spectrum | mi.TensorXf:
         """What stands in the scene."""
         numbers = (self.parameter(x) / self.factor).astype(np.float32)
         value = self.kind(numbers.reshape(self.start.shape)) if self.start.ndim == 3 else self.kind(numbers.tolist())
@@ -467,7 +467,7 @@ class TextureDescent:
         image, found = self.comparison.sloped(which, k, purpose, self._followed(), self._put, sloped)
         return image, np.stack([each.ravel() for each in found]) if sloped else None
 
-    def _put(self, followed: Mapping[str, Any]) -> None:
+    def _put(self, followed: Variables) -> None:
         """Set textures and constants, these with their gradients, and what has those of textures."""
         for v, x in zip(self.variables, self._parts()):
             self.scene_parameters[v.key] = v.numbers(x) if v.is_texture else followed[v.name]
@@ -477,7 +477,7 @@ class TextureDescent:
         textures = {FIELDS.get(v.name, v.name): followed[v.name] for v in self.variables if v.is_texture}
         surface.spec = surface.spec.with_variables(surface, **textures)
 
-    def _followed(self) -> dict[str, Any]:
+    def _followed(self) -> Variables:
         """Constants, and an even change of each texture."""
         pairs = zip(self.variables, self._parts())
         return {v.name: dr.opaque(mi.Spectrum, 0) if v.is_texture else v.numbers(x) for v, x in pairs}

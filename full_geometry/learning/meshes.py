@@ -6,12 +6,15 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from halfspace_sss.checks import check_count
 from halfspace_sss.provenance import write_atomically
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 # ----------------------------------------------------------------------------------------------------
 # Signed distances: primitives, how they are joined, bent and made rough; points (..., 3) in mm, y up, inside < 0.
@@ -216,7 +219,7 @@ class Mesh:
         a, b, c = np.moveaxis(self.vertices[self.faces], 1, 0)
         return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
 
-    def mitsuba(self, name: str, bsdf: Any = None) -> Any:
+    def mitsuba(self, name: str, bsdf: mi.BSDF | None = None) -> mi.Mesh:
         """The mesh as a shape of Mitsuba, with smooth normals; bsdf is a loaded BSDF, by default a diffuse one.
 
         Normals by libigl: Mitsuba adds them up in the order of its threads, which differs in the last bit.

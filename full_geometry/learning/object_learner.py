@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from importlib.util import find_spec
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,8 +19,11 @@ from halfspace_sss.neural.store import check_weights_folder, load_weights
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.registry import models as half_space_models
 
+if TYPE_CHECKING:
+    import mitsuba as mi
 
-def untrained(scene: Any) -> list[str]:
+
+def untrained(scene: mi.Scene) -> list[str]:
     """Ids of the objects of a scene that have this model and no weights yet; none without torch, which learns them.
 
     Raises:
@@ -40,7 +43,7 @@ def untrained(scene: Any) -> list[str]:
     return missing
 
 
-def train(scene: Any, **how: Any) -> LearntObject:
+def train(scene: mi.Scene, **how: Any) -> LearntObject:
     """As `learning.training.train`; rows of errors have the names of object and channels."""
     from full_geometry.learning.training import train as learn
 
@@ -50,7 +53,7 @@ def train(scene: Any, **how: Any) -> LearntObject:
 
 
 def errors(
-    scene: Any,
+    scene: mi.Scene,
     models: Sequence[str] = (),
     *,
     object: str | None = None,
@@ -81,7 +84,7 @@ def errors(
     return [row for model, rows in by_model.items() for row in _rows(name, model, rows)]
 
 
-def cost(scene: Any, object: str) -> float:
+def cost(scene: mi.Scene, object: str) -> float:
     """Seconds that the weights of an object of a scene took to learn; ValueError if it has not been trained."""
     path = find_weights(object_of(scene, None, None, object))
     return float(load_weights(path, KIND)[1].get("seconds", 0.0))

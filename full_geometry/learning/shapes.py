@@ -6,7 +6,6 @@ Families of training and those that are held out share no generator.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import numpy as np
 
@@ -31,7 +30,7 @@ Made = tuple[Distance, Box]
 Family = Callable[[np.random.Generator], Made]
 
 
-def margin(low: Any, high: Any, part: float = 0.06) -> Box:
+def margin(low: np.ndarray, high: np.ndarray, part: float = 0.06) -> Box:
     """The box from low to high with a margin, a part of its longest side."""
     low, high = np.asarray(low, float), np.asarray(high, float)
     wide = part * float((high - low).max())

@@ -186,7 +186,7 @@ def _points(part: Any) -> tuple[SurfacePoint, WalkExits]:
     return starts, WalkExits(ends, dr.select(part.order >= 1, part.throughput, 0), part.order, part.face)
 
 
-def _lanes(numbers: np.ndarray) -> Any:
+def _lanes(numbers: np.ndarray) -> mi.UInt32:
     return mi.UInt32(numbers.astype(np.uint32))
 
 

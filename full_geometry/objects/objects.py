@@ -30,6 +30,7 @@ from full_geometry.geometry.instances import (
 )
 from full_geometry.geometry.points import (
     AreaPoints,
+    MediumAt,
     ObjectAlbedo,
     Proposals,
     SurfacePoint,
@@ -51,7 +52,7 @@ from full_geometry.geometry.snapshot import Snapshot
 from full_geometry.objects.inclusions import Inclusion, find_inclusions, place_of
 from full_geometry.surface.medium_derivatives import MediumDerivatives
 from full_geometry.surface.spectral import MediumByWavelength
-from full_geometry.surface.textured import MediumAt, TexturedMedium
+from full_geometry.surface.textured import TexturedMedium
 from full_geometry.surface.translucent import MediumSpec, check_boundary
 from full_geometry.surface.varying import VaryingMedium, equivalent
 from full_geometry.surface.wrapped import Wrapping, surface_of, wrapping_of
@@ -178,7 +179,7 @@ def places_of(scene: mi.Scene) -> list:
     return [*map(geometry_of, shapes), *(None if place is None else place.tolist() for place in lamps)]
 
 
-def translucent_shapes(scene: mi.Scene) -> list[Any]:
+def translucent_shapes(scene: mi.Scene) -> list[mi.Shape]:
     """The shapes whose surface is `translucent`: of the scene, and of the groups that instances in it show.
 
     Raises:
@@ -443,7 +444,7 @@ def expected_of(media: Sequence[Medium]) -> Expected:
 
 
 def object_of(
-    shape: Any, medium: Medium | None = None, mm_per_unit: float | None = None, name: str | None = None
+    shape: mi.Shape | mi.Scene, medium: Medium | None = None, mm_per_unit: float | None = None, name: str | None = None
 ) -> TranslucentObject:
     """The object of a shape filled with a medium, or the one called `name` in a scene.
 
@@ -526,7 +527,7 @@ def _check_inclusions(name: str, inclusions: Inclusions) -> None:
             raise ValueError(f"media inside {name} must be homogeneous to be learnt, got that of {name_of(shape)}")
 
 
-def _object_of(scene: Any, name: str | None) -> Any:
+def _object_of(scene: mi.Scene, name: str | None) -> mi.Shape:
     """The translucent shape called `name` in a scene, or the only one that lies in no other.
 
     Raises:

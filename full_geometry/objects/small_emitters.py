@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -118,7 +118,7 @@ class SmallEmitters:
     emitters: list[mi.Emitter]
     n_delta: int
     suns: list[Sun]
-    tables: dict[str, Any]
+    tables: dict[str, mi.Float | mi.UInt32 | mi.Int32 | mi.Bool]
 
     @classmethod
     def of(cls, scene: mi.Scene) -> SmallEmitters | None:

@@ -17,6 +17,8 @@ from full_geometry.scenes.reference_store import Reference, load, save
 
 if TYPE_CHECKING:
     from full_geometry.integrators.walk_paths import FirstExits
+    from full_geometry.settings import Settings
+    from full_geometry.walk.media import WalkMedia
 
 TRIAL = 2**31  # number of a pass that is no part of the image
 PASSES = "passes of objects"
@@ -39,7 +41,7 @@ class CameraWalks:
     """
 
     def __init__(
-        self, scene: Any, settings: Any, sensor: int, seed: int, path: Path, about: dict[str, Any],
+        self, scene: mi.Scene, settings: Settings, sensor: int, seed: int, path: Path, about: dict[str, Any],
         progress: Callable[[Reference], None] | None = None,
     ) -> None:  # fmt: skip
 
@@ -57,7 +59,7 @@ class CameraWalks:
         """Camera rays of one sample per pixel."""
         return int(np.prod(np.array(self.sensor.film().crop_size())))
 
-    def hits(self, shape: Any) -> int:
+    def hits(self, shape: mi.Shape) -> int:
         """About how many paths of one sample per pixel meet an object first."""
 
         from full_geometry.geometry.sensors import camera_rays
@@ -68,7 +70,7 @@ class CameraWalks:
             met = FirstExits.of(self.scene, media, camera_rays(self.sensor, 1, (self.seed, TRIAL))[0])
             return int(dr.count(met.object == self._number(media, shape))[0])
 
-    def exits(self, shape: Any, number: int, spp: int) -> list[FirstExits]:
+    def exits(self, shape: mi.Shape, number: int, spp: int) -> list[FirstExits]:
         """First exits of the paths that meet an object first, from a pass of spp samples per pixel.
 
         Args:
@@ -91,7 +93,7 @@ class CameraWalks:
         return kept
 
     @staticmethod
-    def _number(media: Any, shape: Any) -> int:
+    def _number(media: WalkMedia, shape: mi.Shape) -> int:
         """Of an object among those of the walk."""
         (k,) = (k for k, obj in enumerate(media.objects) if obj.shape is shape or obj.shape.id() == shape.id())
         return k

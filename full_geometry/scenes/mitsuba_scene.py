@@ -12,13 +12,14 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.surface.translucent import is_smooth_boundary
+from full_geometry.surface.translucent import MediumSpec, is_smooth_boundary
+from full_geometry.surface.varying import VaryingMedium
 
 FAR = 1e5  # scene units within which objects lie
 VOLUME_PATH = {"type": "volpathmis", "max_depth": -1, "rr_depth": 64}
 
 
-def with_media(scene: dict | str | Path, mm_per_unit: float, integrator: dict | None = None) -> Any:
+def with_media(scene: dict | str | Path, mm_per_unit: float, integrator: dict | None = None) -> mi.Scene:
     """A Mitsuba scene in which each translucent object is a dielectric shape filled with a `homogeneous` medium,
     or with a `heterogeneous` one where the medium varies in space.
 
@@ -52,7 +53,7 @@ def with_media(scene: dict | str | Path, mm_per_unit: float, integrator: dict | 
     return mi.parser.instantiate(config, state)
 
 
-def _references(props: Any) -> list[tuple[str, int]]:
+def _references(props: mi.Properties) -> list[tuple[str, int]]:
     """Names and node numbers of what a node refers to."""
     values = [(key, props[key]) for key in props.keys()]
     return [(key, value.index()) for key, value in values if isinstance(value, mi.Properties.ResolvedReference)]
@@ -94,7 +95,7 @@ def _replace_integrator(state: Any, integrator: dict) -> None:
 _OURS = ("bssrdf", "translucent_walk")
 
 
-def medium(spec: Any, mm_per_unit: float) -> Any:
+def medium(spec: MediumSpec, mm_per_unit: float) -> mi.Medium:
     """The `homogeneous` or `heterogeneous` medium of a `MediumSpec`."""
     if spec.orders != "total" or not spec.reflection:
         raise ValueError(
@@ -120,7 +121,7 @@ def medium(spec: Any, mm_per_unit: float) -> Any:
     return mi.load_dict({"type": "homogeneous", **values, "scale": scale * mm_per_unit, "phase": phase})
 
 
-def _volumes(varying: Any, mm_per_unit: float) -> dict:
+def _volumes(varying: VaryingMedium, mm_per_unit: float) -> dict:
     """The coefficients of a `heterogeneous` medium."""
     scale, albedo = varying.factor, varying.albedo
     if varying.density is not None and np.ptp(scale) > 0:

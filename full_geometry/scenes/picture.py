@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -29,7 +28,7 @@ class Picture:
     image: np.ndarray
     numbers: Mapping[str, str]
     caption: str
-    scene: Any
+    scene: mi.Scene
     sensor: int
     denoise: bool
     emission: np.ndarray | None = None
@@ -53,7 +52,7 @@ def as_png(image: np.ndarray) -> bytes:
     return _written(mi.util.convert_to_bitmap(mi.TensorXf(image.astype(np.float32))), mi.Bitmap.FileFormat.PNG)
 
 
-def _written(bitmap: Any, kind: Any) -> bytes:
+def _written(bitmap: mi.Bitmap, kind: mi.Bitmap.FileFormat) -> bytes:
     stream = mi.MemoryStream()
     bitmap.write(stream, kind)
     return bytes(stream.raw_buffer())

@@ -39,20 +39,15 @@ Progress = Callable[[Reference], None]
 
 
 def render(
-    scene: Any,
+    scene: mi.Scene | dict[str, Any] | str | os.PathLike,
     path: str | os.PathLike,
     *,
     integrator: dict | None = None,
     sensor: int = 0,
-    spp_per_pass: int | None = None,
     seed: int = 0,
-    spp: int | None = None,
-    passes: int | None = None,
-    target_error: float | None = None,
-    seconds: float | None = None,
-    interval: float = 30.0,
     resume: bool | str | os.PathLike = True,
     progress: Progress | None = None,
+    **limits: float | None,
 ) -> Reference:
     """Render a scene in passes into an EXR file, or go on with the file that is there.
 
@@ -64,47 +59,41 @@ def render(
         path: of the EXR file; a JSON file beside it repeats its header.
         integrator: dict of the integrator; by default that of the scene.
         sensor: number of the sensor.
-        spp_per_pass: samples per pixel of a pass; by default passes grow with what is there, from 1 to 64. The last
-            one is cut to `spp`.
         seed: of the run.
-        spp: samples per pixel in all.
-        passes: number of passes in all.
-        target_error: `Reference.relative_error` to come down to; looked at from the 8th pass on.
-        seconds: of rendering in all.
-        interval: seconds between writes of the file; 0 writes after every pass.
         resume: True goes on with the file at `path` if there is one, False begins anew, another path goes on with the
             file there and leaves it as it is.
         progress: called after each pass.
+        limits: fields of `Limits`, one of `spp`, `passes`, `target_error` and `seconds` at least.
 
     Raises:
         ValueError: an argument is out of range, the file is damaged, of another render or written by another run, or a
             pass has values that are not finite.
     """
-    limits = Limits(spp, passes, target_error, seconds)
-    _check(spp_per_pass, seed, interval)
+    until = Limits(**limits)
+    check_count("seed", seed, 0)
     path = Path(path)
     if path.suffix.lower() != ".exr":
         raise ValueError(f"path must end in .exr, got {str(path)!r}")
     check_folder(path.parent)
     scene, integrator = loaded(scene, integrator, sensor)
     with one_writer(path):
-        return _in_passes(scene, path, integrator, sensor, seed, limits, spp_per_pass, interval, resume, progress)
+        about = about_render(scene, integrator, sensor, seed) | chosen(scene, integrator)
+        about["learnt"] = learnt(scene, integrator)
+        return _in_passes(scene, integrator, path, about, until, resume, progress)
 
 
 def _in_passes(
-    scene: mi.Scene, path: Path, integrator: mi.Integrator, sensor: int, seed: int, limits: Limits,
-    spp_per_pass: int | None, interval: float, resume: bool | str | os.PathLike, progress: Progress | None,
+    scene: mi.Scene, integrator: mi.Integrator, path: Path, about: dict[str, Any], limits: Limits,
+    resume: bool | str | os.PathLike, progress: Progress | None,
 ) -> Reference:  # fmt: skip
-    """See `render`."""
-    about = about_render(scene, integrator, sensor, seed) | chosen(scene, integrator)
-    about["learnt"] = learnt(scene, integrator)
+    """Take passes until a limit is reached, and write the file now and then and at the end."""
     result = _start(path, resume, about)
     written = result if resume is True else None
     last = time.monotonic()
     try:
         while not limits.reached(result):
-            result = _pass(result, scene, integrator, sensor, about, _pass_spp(result, spp_per_pass, limits.spp))
-            if time.monotonic() - last >= interval:
+            result = _pass(result, scene, integrator, about, limits.next_spp(result))
+            if time.monotonic() - last >= limits.interval:
                 _keep(path, result)
                 written, last = result, time.monotonic()
             if progress is not None:
@@ -126,23 +115,44 @@ def _keep(path: Path, reference: Reference) -> None:
 
 @dataclass(frozen=True)
 class Limits:
-    """What ends a run: samples per pixel, passes, relative error, seconds, whichever comes first; None is no limit."""
+    """What ends a run, whichever comes first, and how it goes there; None is no limit.
 
-    spp: int | None
-    passes: int | None
-    target_error: float | None
-    seconds: float | None
+    Args:
+        spp: samples per pixel in all.
+        passes: number of passes in all.
+        target_error: `Reference.relative_error` to come down to; looked at from the 8th pass on.
+        seconds: of rendering in all.
+        spp_per_pass: samples per pixel of a pass; by default passes grow with what is there, from 1 to 64. The last
+            one is cut to `spp`.
+        interval: seconds between writes of the file; 0 writes after every pass.
+    """
+
+    spp: int | None = None
+    passes: int | None = None
+    target_error: float | None = None
+    seconds: float | None = None
+    spp_per_pass: int | None = None
+    interval: float = 30.0
 
     def __post_init__(self) -> None:
-        if all(value is None for value in vars(self).values()):
-            raise ValueError(f"one of {', '.join(vars(self))} must be given, got none")
-        for name in ("spp", "passes"):
+        ends = ("spp", "passes", "target_error", "seconds")
+        if all(getattr(self, name) is None for name in ends):
+            raise ValueError(f"one of {', '.join(ends)} must be given, got none")
+        for name in ("spp", "passes", "spp_per_pass"):
             if getattr(self, name) is not None:
                 check_count(name, getattr(self, name), 1)
         for name in ("target_error", "seconds"):
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{name} must be finite and > 0, got {value!r}")
+        if not self.interval >= 0:
+            raise ValueError(f"interval must be >= 0, got {self.interval!r}")
+
+    def next_spp(self, reference: Reference | None) -> int:
+        """Samples per pixel of the next pass; a power of two where it grows, for Mitsuba compiles others anew."""
+        done = reference.spp if reference else 0
+        size = self.spp_per_pass or min(2 ** (max(done // SHARE, 1).bit_length() - 1), LARGEST_PASS)
+        return size if self.spp is None else min(size, self.spp - done)
 
     def reached(self, reference: Reference | None) -> bool:
         if reference is None:
@@ -162,16 +172,11 @@ class Limits:
         return min(max(shares, default=0.0), 1.0)
 
 
-def _pass_spp(reference: Reference | None, fixed: int | None, most: int | None) -> int:
-    """Samples per pixel of the next pass; a power of two where it grows, for Mitsuba compiles others anew."""
-    done = reference.spp if reference else 0
-    size = fixed or min(2 ** (max(done // SHARE, 1).bit_length() - 1), LARGEST_PASS)
-    return size if most is None else min(size, most - done)
-
-
-def _pass(reference: Reference | None, scene: Any, integrator: Any, sensor: int, about: dict, spp: int) -> Reference:
+def _pass(
+    reference: Reference | None, scene: mi.Scene, integrator: mi.Integrator, about: dict[str, Any], spp: int
+) -> Reference:
     """One more pass."""
-    number = reference.passes if reference else 0
+    number, sensor = reference.passes if reference else 0, about["sensor"]
     started = time.perf_counter()
     seed = int(np.random.SeedSequence([about["seed"], number]).generate_state(1)[0])
     image = mi.render(scene, sensor=sensor, integrator=integrator, seed=seed, spp=spp)
@@ -207,15 +212,9 @@ def channel_names(film: mi.Film, integrator: mi.Integrator, channels: int) -> li
     return next((names for names in known if len(names) == channels), [])
 
 
-def _check(spp_per_pass: int | None, seed: int, interval: float) -> None:
-    if spp_per_pass is not None:
-        check_count("spp_per_pass", spp_per_pass, 1)
-    check_count("seed", seed, 0)
-    if not interval >= 0:
-        raise ValueError(f"interval must be >= 0, got {interval!r}")
-
-
-def loaded(scene: Any, integrator: dict | None, sensor: int) -> tuple[Any, Any]:
+def loaded(
+    scene: mi.Scene | dict[str, Any] | str | os.PathLike, integrator: dict[str, Any] | None, sensor: int
+) -> tuple[mi.Scene, mi.Integrator]:
     """The scene and its integrator as Mitsuba objects; errors as of `render`."""
     if isinstance(scene, (str, os.PathLike)) and not Path(scene).is_file():
         raise ValueError(f"scene must be a dict, a Mitsuba scene or a file, got {os.fspath(scene)!r}")
@@ -233,7 +232,7 @@ def loaded(scene: Any, integrator: dict | None, sensor: int) -> tuple[Any, Any]:
     return scene, integrator
 
 
-def check_sensor(scene: Any, sensor: int) -> None:
+def check_sensor(scene: mi.Scene, sensor: int) -> None:
     """ValueError unless there is such a sensor, with a film that has pixels and fits into memory."""
     n = len(scene.sensors())
     if n == 0:
@@ -246,7 +245,7 @@ def check_sensor(scene: Any, sensor: int) -> None:
         raise ValueError(f"a film must have 1 to {MOST_PIXELS} pixels, got {width} x {height}")
 
 
-def about_render(scene: Any, integrator: Any, sensor: int, seed: int) -> dict[str, Any]:
+def about_render(scene: mi.Scene, integrator: mi.Integrator, sensor: int, seed: int) -> dict[str, Any]:
     """What tells one render from another, with its provenance."""
     about = {
         "scene": scene_hash(scene, integrator),
@@ -258,7 +257,7 @@ def about_render(scene: Any, integrator: Any, sensor: int, seed: int) -> dict[st
     return {**about, "provenance": provenance(**about)}
 
 
-def chosen(scene: Any, integrator: Any) -> dict[str, Any]:
+def chosen(scene: mi.Scene, integrator: mi.Integrator) -> dict[str, Any]:
     """What was chosen for "auto" and why; it is chosen now if it has not been."""
     if not is_bssrdf(integrator):
         return {}
@@ -298,7 +297,7 @@ def check_same(reference: Reference, path: Path, about: dict[str, Any]) -> None:
         raise ValueError(f"{path} must be of the same versions to go on with it, got {versions[0]} and {versions[1]}")
 
 
-def learnt(scene: Any, integrator: Any) -> list[str]:
+def learnt(scene: mi.Scene, integrator: mi.Integrator) -> list[str]:
     """Checksums of what the models of the objects have learnt, for an integrator that asks them, or holds one.
 
     The same scene is another render after a training.

@@ -73,7 +73,7 @@ class MediumDerivatives:
         plane: name of the half-space model that knows the same media; "" where the model has no derivatives by them.
     """
 
-    def __init__(self, surface: Any, mm_per_unit: float, model: str, plane: str) -> None:
+    def __init__(self, surface: mi.BSDF, mm_per_unit: float, model: str, plane: str) -> None:
         self.surface, self.spec, self.mm_per_unit = surface, surface.spec, mm_per_unit
         self.model, self.plane = model, plane
         self._stencils: dict[str, Stencil] = {}
@@ -103,7 +103,7 @@ class MediumDerivatives:
             for m in self.spec.channels():
                 self._places(name, m)
 
-    def _stencil(self, name: str, transport: Any) -> Stencil:
+    def _stencil(self, name: str, transport: DifferentiableTransport) -> Stencil:
         places = [self._places(name, m) for m in self.spec.channels()]
         sides = [transport.transport.perturbed(media) for media in zip(*(media for media, _ in places))]
         columns = zip(*(coefficients for _, coefficients in places))
@@ -145,7 +145,7 @@ class MediumDerivatives:
             result = result + slope * (theta - dr.detach(theta))
         return result
 
-    def coefficients(self, media: Sequence[Medium]) -> list[tuple[Any, Any, Any]]:
+    def coefficients(self, media: Sequence[Medium]) -> list[tuple[mi.Float, mi.Float, mi.Float]]:
         """sigma_s, sigma_t in 1/(scene unit) and g of each channel, with derivatives where they are followed."""
         results = []
         for k, m in enumerate(media):

@@ -17,9 +17,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.geometry.points import SurfacePoint, opaque
+from full_geometry.geometry.points import MediumAt, SurfacePoint, opaque
 from full_geometry.geometry.shape import Geometry
-from full_geometry.surface.textured import MediumAt
 from halfspace_sss.materials.spectra import SpectralMedium, read_spectra
 from halfspace_sss.physics.medium import Medium
 
@@ -28,6 +27,7 @@ CHANNELS = 4  # wavelengths of a ray
 EVERYWHERE = np.array([1.0, 1e6])  # nm, of media given by numbers
 IN_UNITS = ("sigma_s", "sigma_a", "sigma_t", "mfp")  # no colours: rgb is a reflectance in [0, 1]
 LOOKS = 256  # wavelengths that a sensor is asked for
+Values = "mi.Spectrum | np.ndarray"
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +92,7 @@ class MediumByWavelength:
         albedo, sigma_t = self._similar(sigma_s / np.maximum(sigma_t, 1e-30), sigma_t, g)
         return albedo, self.scale * sigma_t
 
-    def _similar(self, albedo: Any, sigma_t: Any, g: Any) -> tuple[Any, Any]:
+    def _similar(self, albedo: Values, sigma_t: Values, g: Values) -> tuple[Values, Values]:
         factor = (1 - g) / (1 - self.mean().g.mean())
         extinction = sigma_t * (albedo * factor + 1 - albedo)
         return albedo * factor * sigma_t / (extinction + 1e-30), extinction

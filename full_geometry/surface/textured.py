@@ -22,7 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.geometry import mesh
-from full_geometry.geometry.points import SurfacePoint, opaque
+from full_geometry.geometry.points import MediumAt, SurfacePoint, opaque
 from full_geometry.geometry.shape import Geometry, name_of
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.physics.reflectance import albedo_of_reflectance, half_space_reflectance
@@ -101,17 +101,6 @@ def x_of_albedo(lib: Any, albedo: Any, g: Any, c: Any) -> Any:
     return s * c / (1 - (1 - c) * s)
 
 
-@dataclass
-class MediumAt:
-    """The medium at a point of the surface, per channel, and the number of the face there."""
-
-    albedo: mi.Spectrum
-    sigma_t: mi.Spectrum
-    face: mi.UInt32
-    g: mi.Spectrum | tuple[()] = ()  # and the wavelengths, nm, under spectral variants
-    wavelengths: mi.Spectrum | tuple[()] = ()
-
-
 @dataclass(frozen=True, eq=False)
 class TexturedMedium:
     """Albedo and extinction at points of the surface.
@@ -126,8 +115,8 @@ class TexturedMedium:
             others in place of texels, all of which then change alike.
     """
 
-    albedo: Any
-    sigma_t: Any
+    albedo: mi.Texture | np.ndarray
+    sigma_t: mi.Texture | np.ndarray
     scale: float = 1.0
     table: AlbedoTable | None = None
     inverse: bool = False
@@ -183,7 +172,7 @@ class TexturedMedium:
         value = mi.Spectrum(source.eval(si, active))
         return value if followed is None else dr.detach(value) + followed - dr.detach(followed)
 
-    def _extinction(self, value: Any) -> Any:
+    def _extinction(self, value: mi.Spectrum) -> mi.Spectrum:
         scale = opaque(self.scale)
         return scale / value if self.inverse else value * scale
 
@@ -211,7 +200,7 @@ class TexturedMedium:
         sigma_t = 1 / values["mfp"] if self.inverse else values.get("sigma_t", np.atleast_2d(self.sigma_t))
         return albedo.astype(float), self.scale * sigma_t.astype(float)
 
-    def mean(self, g: Any, eta: float, shape: mi.Shape | None = None) -> Medium:
+    def mean(self, g: np.ndarray | float, eta: float, shape: mi.Shape | None = None) -> Medium:
         """The homogeneous medium with the means of albedo and extinction over texels, and over vertices of a mesh.
 
         Args:
@@ -406,7 +395,7 @@ def check_values(name: str, values: np.ndarray, hint: str = "") -> None:
         raise ValueError(f"{name} must be {bound}, got {float(values[~ok].flat[0])!r}{hint}")
 
 
-def textured_medium(values: dict[str, Any], g: Any, eta: float, channels: int) -> TexturedMedium:
+def textured_medium(values: dict[str, Any], g: np.ndarray | float, eta: float, channels: int) -> TexturedMedium:
     """The medium of parameters of which at least one is a texture.
 
     Args:

@@ -46,7 +46,7 @@ from __future__ import annotations
 import functools
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -57,8 +57,8 @@ import numpy as np
 from full_geometry.geometry.points import mirrored, opaque
 from full_geometry.settings import ORDERS, check_parameters, variant_channels
 from full_geometry.surface.spectral import EVERYWHERE, MediumByWavelength, read_file, spectral_medium
-from full_geometry.surface.textured import constant_texture, textured_medium
-from full_geometry.surface.varying import constant_value, mean_of_grids, varying_medium
+from full_geometry.surface.textured import TexturedMedium, constant_texture, textured_medium
+from full_geometry.surface.varying import VaryingMedium, constant_value, mean_of_grids, varying_medium
 from halfspace_sss import materials
 from halfspace_sss.checks import check_choice
 from halfspace_sss.materials.registry import one_channel
@@ -110,7 +110,7 @@ def _boundary_class(variant: str) -> type:
 
         def sample(
             self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, u: mi.Float, v: mi.Point2f, active: mi.Bool = True
-        ) -> tuple[Any, Any]:
+        ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
             reflects = ctx.is_enabled(mi.BSDFFlags.DeltaReflection, REFLECTED)
             refracts = ctx.is_enabled(mi.BSDFFlags.DeltaTransmission, REFRACTED)
             bs, both = dr.zeros(mi.BSDFSample3f), reflects and refracts
@@ -131,15 +131,17 @@ def _boundary_class(variant: str) -> type:
 
         def eval(
             self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-        ) -> Any:
+        ) -> mi.Spectrum:
             return mi.Spectrum(0)
 
-        def pdf(self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True) -> Any:
+        def pdf(
+            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
+        ) -> mi.Float:
             return mi.Float(0)
 
         def eval_pdf(
             self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-        ) -> tuple[Any, Any]:
+        ) -> tuple[mi.Spectrum, mi.Float]:
             return mi.Spectrum(0), mi.Float(0)
 
         def to_string(self) -> str:
@@ -151,7 +153,7 @@ def _boundary_class(variant: str) -> type:
 DIELECTRICS = ("SmoothDielectric", "RoughDielectric")
 
 
-def boundary_of(surfaces: list[Any], eta: float) -> Any:
+def boundary_of(surfaces: list[mi.BSDF], eta: float) -> mi.BSDF:
     """The boundary of a medium from the BSDFs inside a surface: at most one, a dielectric of the same index.
 
     Raises:
@@ -213,7 +215,7 @@ class Reflection:
         lobe: number of its component that reflects.
     """
 
-    boundary: Any
+    boundary: mi.BSDF
     lobe: int
 
     @classmethod
@@ -226,7 +228,7 @@ class Reflection:
 
     def sample(
         self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, u: mi.Float, v: mi.Point2f, active: mi.Bool
-    ) -> tuple[Any, Any]:
+    ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
         """A direction and its weight; one that a smooth boundary reflects to below the surface is reflected again."""
         seen, sign = _from_outside(si)
         bs, weight = self.boundary.sample(self._context(ctx), seen, u, v, active)
@@ -237,21 +239,21 @@ class Reflection:
         bs.sampled_component = 0
         return bs, weight
 
-    def eval(self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool) -> Any:
+    def eval(self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool) -> mi.Spectrum:
         """Value times cosine."""
         seen, sign = _from_outside(si)
         return self.boundary.eval(self._context(ctx), seen, _turned(wo, sign), active)
 
-    def pdf(self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool) -> Any:
+    def pdf(self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool) -> mi.Float:
         """Density of `sample`."""
         seen, sign = _from_outside(si)
         return self.boundary.pdf(self._context(ctx), seen, _turned(wo, sign), active)
 
-    def _context(self, ctx: mi.BSDFContext) -> Any:
+    def _context(self, ctx: mi.BSDFContext) -> mi.BSDFContext:
         return mi.BSDFContext(ctx.mode, ctx.type_mask, self.lobe)
 
 
-def _from_outside(si: mi.SurfaceInteraction3f) -> tuple[Any, Any]:
+def _from_outside(si: mi.SurfaceInteraction3f) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
     """The interaction with the normal on the side that is seen, and 1, or -1 where it was turned."""
     sign = dr.select(mi.Frame3f.cos_theta(si.wi) < 0, mi.Float(-1), 1)
     seen = mi.SurfaceInteraction3f(si)
@@ -259,7 +261,7 @@ def _from_outside(si: mi.SurfaceInteraction3f) -> tuple[Any, Any]:
     return seen, sign
 
 
-def _turned(w: mi.Vector3f, sign: mi.Float) -> Any:
+def _turned(w: mi.Vector3f, sign: mi.Float) -> mi.Vector3f:
     """A local direction in the frame that is turned about its first axis where the sign is -1."""
     return mi.Vector3f(w.x, w.y * sign, w.z * sign)
 
@@ -300,7 +302,7 @@ def _class(variant: str) -> type:
             self.m_components = [self.boundary.flags(self.reflection.lobe)]
             self.m_flags = self.m_components[0]
             self.directional: HalfSpaceAlbedo | None = None  # made when it is asked for
-            self.asked: list[Any] | None = None  # shading frames that it is asked with, while `surface.wrapped` listens
+            self.asked: list[mi.Frame3f] | None = None  # shading frames of calls, while `surface.wrapped` listens
             for name in VARIABLE:
                 setattr(self, name, mi.Spectrum(np.atleast_1d(getattr(self.spec.medium, name)).tolist()))
             self.spec = self.spec.with_variables(self)
@@ -313,7 +315,7 @@ def _class(variant: str) -> type:
                 callback.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
             callback.put("boundary", self.boundary, mi.ParamFlags.Differentiable)
 
-        def parameters_changed(self, keys: Any = ()) -> None:
+        def parameters_changed(self, keys: Sequence[str] = ()) -> None:
             # the integrators see another `spec`, and make anew what they made of it
             repainted = self.spec.textured is not None and not (keys and all(k.startswith("boundary") for k in keys))
             if repainted or (self.spec.constants and self.spec.textured is None):
@@ -321,7 +323,7 @@ def _class(variant: str) -> type:
                 self.spec = self.spec.changed(**values).with_variables(self)
             check_eta(self.boundary, self.spec.medium.eta)
 
-        def _shown(self, ctx: mi.BSDFContext, value: Any) -> Any:
+        def _shown(self, ctx: mi.BSDFContext, value: mi.Spectrum) -> mi.Spectrum:
             return value if self.spec.reflection and ctx.component in (0, 0xFFFFFFFF) else 0 * value
 
         def sample(
@@ -331,24 +333,26 @@ def _class(variant: str) -> type:
             sample1: mi.Float,
             sample2: mi.Point2f,
             active: mi.Bool = True,
-        ) -> tuple[Any, Any]:
+        ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
             bs, weight = self.reflection.sample(ctx, si, sample1, sample2, active)
             return bs, self._shown(ctx, weight)
 
         def eval(
             self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-        ) -> Any:
+        ) -> mi.Spectrum:
             if self.asked is not None:
                 self.asked.append(mi.Frame3f(si.sh_frame))
                 return mi.Spectrum(0)
             return self._shown(ctx, self.reflection.eval(ctx, si, wo, active))
 
-        def pdf(self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True) -> Any:
+        def pdf(
+            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
+        ) -> mi.Float:
             return self._shown(ctx, self.reflection.pdf(ctx, si, wo, active))
 
         def eval_pdf(
             self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-        ) -> tuple[Any, Any]:
+        ) -> tuple[mi.Spectrum, mi.Float]:
             return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
 
         def eval_diffuse_reflectance(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
@@ -410,7 +414,7 @@ class HalfSpaceAlbedo:
         return dr.exp(self._tables[g].eval(mi.Point2f(*at))[0])
 
 
-def _boundaries(props: mi.Properties) -> list[tuple[str, Any]]:
+def _boundaries(props: mi.Properties) -> list[tuple[str, mi.BSDF]]:
     """Names and surfaces of what stands inside."""
     return [(key, each) for key, each in props.objects() if isinstance(each, mi.BSDF)]
 
@@ -445,9 +449,9 @@ class MediumSpec:
     model: str
     orders: str
     reflection: bool
-    varying: Any = None
-    textured: Any = None
-    spectral: Any = None
+    varying: VaryingMedium | None = None
+    textured: TexturedMedium | None = None
+    spectral: MediumByWavelength | None = None
 
     @property
     def is_homogeneous(self) -> bool:
@@ -493,7 +497,7 @@ class MediumSpec:
             new = {name: float(value[0]) for name, value in new.items()}
         return replace(self, label="medium", medium=Medium.from_albedo(**new, eta=m.eta))
 
-    def with_variables(self, surface: Any, **more: Any) -> MediumSpec:
+    def with_variables(self, surface: mi.BSDF, **more: mi.Spectrum) -> MediumSpec:
         """The same, with numbers beside textures as the surface has them, by which light may be differentiated."""
         if self.textured is None:
             return self
@@ -514,7 +518,10 @@ def read_medium_spec(props: mi.Properties) -> MediumSpec:
         (label, medium, varying, textured), spectral = _medium(props), None
     model, orders = props.get("model", "neural"), props.get("orders", "total")
     check_choice("orders", orders, ORDERS)
-    return MediumSpec(label, medium, model, orders, bool(props.get("reflection", True)), varying, textured, spectral)
+    return MediumSpec(
+        label=label, medium=medium, model=model, orders=orders, reflection=bool(props.get("reflection", True)),
+        varying=varying, textured=textured, spectral=spectral,
+    )  # fmt: skip
 
 
 COEFFICIENTS = ("sigma_s", "sigma_a", "sigma_t", "albedo", "scale", "reflectance", "mfp", "g", "eta")
@@ -566,7 +573,7 @@ def _clipped(values: dict[str, Any]) -> np.ndarray:
     return np.minimum(R, most)
 
 
-def _medium(props: mi.Properties) -> tuple[str, Medium, Any, Any]:
+def _medium(props: mi.Properties) -> tuple[str, Medium, VaryingMedium | None, TexturedMedium | None]:
     for key in ("spectra", "unit"):
         if key in props:
             raise ValueError(f"{key} must be left out but under a spectral variant, got {props[key]!r}")
@@ -597,7 +604,9 @@ ETA = 1.3  # where none is given
 PAIRS = (("sigma_s", "sigma_a"), ("sigma_t", "albedo"), ("reflectance", "mfp"))
 
 
-def _inline_medium(inline: dict) -> tuple[Medium, Any, Any]:
+def _inline_medium(
+    inline: dict[str, Any],
+) -> tuple[Medium, VaryingMedium | None, TexturedMedium | None]:
     """The medium of coefficients, and how it varies in space or over the surface if it does."""
     values = {k: v if isinstance(v, (mi.Volume, mi.Texture)) else _numbers(k, v) for k, v in inline.items()}
     volumes = [key for key, value in values.items() if isinstance(value, mi.Volume)]
@@ -626,7 +635,7 @@ def _inline_medium(inline: dict) -> tuple[Medium, Any, Any]:
     return mean_of_grids(varying, g, eta), varying, None
 
 
-def _for_variant(label: str, medium: Medium, names: Any, props: mi.Properties) -> tuple[str, Medium]:
+def _for_variant(label: str, medium: Medium, names: Sequence[str] | None, props: mi.Properties) -> tuple[str, Medium]:
     n, wanted = medium.n_channels, variant_channels()
     channel = props["channel"] if "channel" in props else None
     if wanted == 1 and n is not None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -19,7 +19,11 @@ import numpy as np
 from full_geometry.geometry.shape import Geometry, crossings
 from halfspace_sss.physics.medium import Medium
 
+if TYPE_CHECKING:
+    from full_geometry.surface.translucent import MediumSpec
+
 POINTS = 2**15  # at which a medium is averaged over an object
+Coefficient = "mi.Volume | np.ndarray | float"
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,9 +37,9 @@ class VaryingMedium:
         albedo: one value per channel; albedo A is in [0, 1].
     """
 
-    density: Any
+    density: mi.Volume | None
     factor: np.ndarray
-    albedo_volume: Any
+    albedo_volume: mi.Volume | None
     albedo: np.ndarray
 
     def scaled(self, factor: float) -> VaryingMedium:
@@ -60,7 +64,7 @@ class VaryingMedium:
         return mi.Spectrum(self.albedo.tolist()) * eval_volume(self.albedo_volume, p, active)
 
 
-def eval_volume(volume: mi.Volume | None, p: mi.Point3f, active: mi.Bool = True) -> Any:
+def eval_volume(volume: mi.Volume | None, p: mi.Point3f, active: mi.Bool = True) -> mi.Spectrum:
     """The value of a volume at points, one per channel of the variant."""
     n = dr.width(p)
     if volume is None:
@@ -82,7 +86,7 @@ def constant_value(value: Any) -> Any:
     return value
 
 
-def varying_medium(sigma_t: Any, albedo: Any, scale: Any, channels: int) -> VaryingMedium:
+def varying_medium(sigma_t: Coefficient, albedo: Coefficient, scale: Coefficient, channels: int) -> VaryingMedium:
     """The medium of parameters of which at least one is a grid volume.
 
     Args:
@@ -114,7 +118,7 @@ def varying_medium(sigma_t: Any, albedo: Any, scale: Any, channels: int) -> Vary
     return medium
 
 
-def _per_channel(name: str, value: Any, channels: int, most: float = np.inf) -> np.ndarray:
+def _per_channel(name: str, value: np.ndarray | float, channels: int, most: float = np.inf) -> np.ndarray:
     values = np.atleast_1d(np.asarray(value, dtype=float))
     if values.shape not in ((1,), (channels,)):
         raise ValueError(f"{name} must be a number or one per channel ({channels}), got {values.tolist()}")
@@ -139,7 +143,7 @@ def _check_grid(name: str, volume: mi.Volume, channels: int, most: float) -> Non
     _check_range(name, values, most)
 
 
-def mean_medium(medium: VaryingMedium, p: mi.Point3f, g: Any, eta: float) -> Medium:
+def mean_medium(medium: VaryingMedium, p: mi.Point3f, g: np.ndarray | float, eta: float) -> Medium:
     """The homogeneous medium with the means of sigma_s and sigma_a over points."""
     sigma_t, sigma_s = (values.astype(float).mean(axis=1) for values in medium.coefficients(p))
     sigma_a = np.maximum(sigma_t - sigma_s, 0)
@@ -148,7 +152,7 @@ def mean_medium(medium: VaryingMedium, p: mi.Point3f, g: Any, eta: float) -> Med
     )
 
 
-def mean_of_grids(medium: VaryingMedium, g: Any, eta: float) -> Medium:
+def mean_of_grids(medium: VaryingMedium, g: np.ndarray | float, eta: float) -> Medium:
     """The homogeneous medium with the mean extinction and the mean albedo of the grids, before an object is known."""
     sigma_t, albedo = (
         factor * (1.0 if volume is None else grid_values(volume).mean(axis=(0, 1, 2)))
@@ -158,7 +162,7 @@ def mean_of_grids(medium: VaryingMedium, g: Any, eta: float) -> Medium:
     return Medium.from_albedo(*(v if len(v) > 1 else float(v[0]) for v in (albedo, sigma_t)), g, eta)
 
 
-def equivalent(spec: Any, obj: Geometry) -> Any:
+def equivalent(spec: MediumSpec, obj: Geometry) -> MediumSpec:
     """The spec with a homogeneous medium, which models of the half-space take.
 
     Its sigma_s and sigma_a are the means over the volume of the object, its albedo and sigma_t those over textures.
@@ -176,7 +180,7 @@ def equivalent(spec: Any, obj: Geometry) -> Any:
     return replace(spec, medium=mean_medium(spec.varying, p, spec.medium.g, spec.medium.eta))
 
 
-def warn_of_means(spec: Any, obj: Geometry) -> None:
+def warn_of_means(spec: MediumSpec, obj: Geometry) -> None:
     """Warn that models of the half-space take the medium of `equivalent`, if it stands for one that varies."""
     if spec.varying is not None:
         warnings.warn(
@@ -186,7 +190,7 @@ def warn_of_means(spec: Any, obj: Geometry) -> None:
         )
 
 
-def _points(box: mi.ScalarBoundingBox3f) -> Any:
+def _points(box: mi.ScalarBoundingBox3f) -> mi.Point3f:
     """Random points of a box."""
     u = np.random.default_rng(5).random((3, POINTS))
     low, high = (np.array(v, dtype=float)[:, None] for v in (box.min, box.max))

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -146,7 +146,7 @@ def wraps(bsdf: mi.BSDF) -> bool:
     return not is_translucent(bsdf) and _holds_one(bsdf)
 
 
-def surface_of(shape: mi.Shape) -> Any:
+def surface_of(shape: mi.Shape) -> mi.BSDF | None:
     """The `translucent` surface of a shape, whatever is around it; None where it has none.
 
     Raises:
@@ -205,12 +205,12 @@ def wrapping_of(shape: mi.Shape) -> Wrapping | None:
     return Wrapping(bsdf, bend, tuple(mixes))
 
 
-def children(node: mi.Object) -> dict[str, Any]:
+def children(node: mi.Object) -> dict[str, object]:
     """What an object of Mitsuba holds, by name."""
-    found: dict[str, Any] = {}
+    found: dict[str, object] = {}
 
     class Listing(mi.TraversalCallback):
-        def put(self, name: str, value: Any, *flags: Any) -> None:
+        def put(self, name: str, value: object, *flags: object) -> None:
             found[name] = value
 
     node.traverse(Listing())
