@@ -203,8 +203,8 @@ class Geometry:
     area: float
     state: Snapshot
     inclusions: Any = None
-    group: Group | None = None
-    transform: InstanceTransform | None = None
+    group: Any = None
+    transform: Any = None
     lost: float = 0.0
 
     @property
