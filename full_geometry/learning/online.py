@@ -89,7 +89,7 @@ def render(
         walked: called after each pass of walks, with theirs.
         learning: called with (what, done, total) while an object is learnt.
         told: called with a sentence before an object is learnt.
-        limits: as of `reference.render`: spp, passes, target_error, seconds, spp_per_pass, interval.
+        limits: fields of `reference.Limits`.
 
     Returns:
         The image; `about["combined"]` tells of the two phases, `about["training"]` of what was learnt.
@@ -101,7 +101,7 @@ def render(
     check_count("seed", seed, 0)
     check_interval("train_seconds", train_seconds, 0.0, 1e7)
     check_interval("train_error", train_error, 1e-4, 1.0)
-    reference.Limits(*(limits.get(name) for name in ("spp", "passes", "target_error", "seconds")))
+    reference.Limits(**limits)
     check_folder(path.parent)
     scene, integrator = reference.loaded(scene, None, sensor)
     about = reference.about_render(scene, integrator, sensor, seed)
