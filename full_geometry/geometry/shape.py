@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -16,9 +16,6 @@ from scipy.sparse.csgraph import connected_components
 from full_geometry.geometry import mesh
 from full_geometry.geometry.rounding import bound_of, ray_from
 from full_geometry.geometry.snapshot import Snapshot
-
-if TYPE_CHECKING:
-    from full_geometry.geometry.instances import Group, InstanceTransform
 
 MOST_COPIES = 1e-3  # share of the area in faces that exist twice, by which light may then be wrong
 CREASES = 0.01  # of the corners whose vertex normal may be on the other side of the face, as at sharp edges
@@ -233,7 +230,7 @@ class Geometry:
         """`rounding` as data of kernels; of an instance where that stands."""
         return dr.opaque(mi.Float, self.rounding) if self.transform is None else self.transform.rounding
 
-    def as_instance(self, transform: InstanceTransform | None) -> Geometry:
+    def as_instance(self, transform: Any) -> Geometry:
         """The geometry of one instance; its size is that of the largest."""
         return replace(self, transform=transform, size=self.size * self.group.longest)
 
@@ -273,7 +270,7 @@ class Geometry:
         return dr.gather(mi.Float, self.signs, prim_index, active)
 
 
-def analyse_shape(shape: mi.Shape, world: mi.Scene | None = None, groups: Iterable[Group] = ()) -> Geometry:
+def analyse_shape(shape: mi.Shape, world: mi.Scene | None = None, groups: Iterable[Any] = ()) -> Geometry:
     """Find by rays from outside which side of a shape is out; warns if it is open or its faces point to both sides.
 
     A mesh is closed if its edges say so. Rays decide for others, and where edges of faces that touch do not match.

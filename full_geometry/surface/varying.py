@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -18,9 +18,6 @@ import numpy as np
 
 from full_geometry.geometry.shape import Geometry, crossings
 from halfspace_sss.physics.medium import Medium
-
-if TYPE_CHECKING:
-    from full_geometry.surface.translucent import MediumSpec
 
 POINTS = 2**15  # at which a medium is averaged over an object
 Coefficient = "mi.Volume | np.ndarray | float"
@@ -162,7 +159,7 @@ def mean_of_grids(medium: VaryingMedium, g: np.ndarray | float, eta: float) -> M
     return Medium.from_albedo(*(v if len(v) > 1 else float(v[0]) for v in (albedo, sigma_t)), g, eta)
 
 
-def equivalent(spec: MediumSpec, obj: Geometry) -> MediumSpec:
+def equivalent(spec: Any, obj: Geometry) -> Any:
     """The spec with a homogeneous medium, which models of the half-space take.
 
     Its sigma_s and sigma_a are the means over the volume of the object, its albedo and sigma_t those over textures.
@@ -180,7 +177,7 @@ def equivalent(spec: MediumSpec, obj: Geometry) -> MediumSpec:
     return replace(spec, medium=mean_medium(spec.varying, p, spec.medium.g, spec.medium.eta))
 
 
-def warn_of_means(spec: MediumSpec, obj: Geometry) -> None:
+def warn_of_means(spec: Any, obj: Geometry) -> None:
     """Warn that models of the half-space take the medium of `equivalent`, if it stands for one that varies."""
     if spec.varying is not None:
         warnings.warn(

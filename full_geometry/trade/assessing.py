@@ -166,8 +166,7 @@ def _assessed_for(
     few, gathering, _ = promising([first.objects[k] for k in seen], ahead, later, job, effort.seconds)
     rows = [first.objects[k].way(gathering.model) for k in seen] if gathering else []
     reserve = sum(map(gathering_seconds, rows)) / len(seen)
-    known = 0.0 if every else KNOWN * job.tolerance**2
-    alone = not every and not gathering and len(few) == 1
+    known, alone = 0.0 if every else KNOWN * job.tolerance**2, not every and not gathering and len(few) == 1
     left = max(left_of(first) - reserve, LEAST_SHARE * effort.seconds)
     _go_on(samples, first, few, left, None if alone else known, seeded(effort.seed, 71), progress)
     # Gather the light of the most promising technique, or of the next one if the scene refuses it.
@@ -184,11 +183,15 @@ def _assessed_for(
             break
         later = [t for t in later if t != gathering]
         few, gathering, reasons = promising([again.objects[k] for k in seen], ahead, later, job, effort.seconds)
-    # List what was left out with its reason.
-    out |= {t: reasons[t] for t in later if t != gathering}
+    return _with_reasons(again, out | {t: reasons[t] for t in later if t != gathering})
+
+
+def _with_reasons(assessed: Assessment, out: dict[Technique, str]) -> Assessment:
+    """List what was left out of each object, with its reason."""
     refused = tuple(TechniqueTrade(t.name, refusal=reason) for t, reason in out.items() if reason)
-    objects = tuple(replace(o, ways=(*o.ways, *refused)) if o.ways else o for o in again.objects)
-    return replace(again, objects=objects)
+    return replace(
+        assessed, objects=tuple(replace(o, ways=(*o.ways, *refused)) if o.ways else o for o in assessed.objects)
+    )
 
 
 def _go_on(

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mitsuba as mi
 
@@ -20,9 +20,6 @@ from full_geometry.trade.smoothed_environment import SmoothedEnvironment
 from full_geometry.transport.models import model_names
 from halfspace_sss.checks import check_choice
 from halfspace_sss.registry import model_class, models
-
-if TYPE_CHECKING:
-    from full_geometry.trade.sampling import Sampled
 
 LAMBERT = "lambert"
 NO_SINGLE = "without single scattering"
@@ -105,7 +102,7 @@ class Stage:
         shapes: its translucent shapes.
         settings: of its integrator, by parameter name.
         bssrdf: parameters that `bssrdf` alone understands.
-        paces: first samples of earlier runs by (object, technique), so that the next run knows what a sample takes.
+        paces: first `Sampled` of earlier runs by (object, technique), so that the next run knows what a sample takes.
         smoothed: environment by which biases are told; None where the light of the scene tells them.
     """
 
@@ -113,7 +110,7 @@ class Stage:
     shapes: list[mi.Shape]
     settings: dict[str, Any]
     bssrdf: dict[str, Any]
-    paces: dict[tuple[int, Technique], Sampled] = field(default_factory=dict)
+    paces: dict[tuple[int, Technique], Any] = field(default_factory=dict)
     smoothed: SmoothedEnvironment | None = None
     _integrators: dict[Technique, mi.Integrator] = field(default_factory=dict)
 
