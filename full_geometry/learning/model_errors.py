@@ -265,17 +265,14 @@ def errors_of(
 
 
 def errors(
-    shape: Any,
+    shape: mi.Shape | mi.Scene,
     medium: Medium | None = None,
     model: str = "full_geometry",
     *,
     mm_per_unit: float | None = None,
     object: str | None = None,
     folder: str | os.PathLike | None = None,
-    exits: int = 256,
-    walks: int = 8192,
-    samples: int = 8192,
-    seed: int = 0,
+    **sampling: int,
 ) -> list[RadianceError]:
     """The error of a model of an object, by name: what a user is to expect of images before the first one.
 
@@ -288,16 +285,14 @@ def errors(
         mm_per_unit: length of a scene unit, mm; by default what the integrator of a scene says, and 1 for a shape.
         object: id of the object in a scene; may be left out where there is one.
         folder: of weights.
-        exits: number of exits.
-        walks, samples: of each exit, for the truth and for the model.
-        seed: of everything.
+        sampling: `exits`, `walks`, `samples` and `seed` as of `errors_of`.
 
     Raises:
         ValueError: an argument is out of range, the object has not been trained, or there is no such model.
     """
     obj = object_of(shape, medium, mm_per_unit, object)
     transports = {model: transport_of(obj, model, folder)}
-    return errors_of(obj, transports, exits=exits, walks=walks, samples=samples, seed=seed)[model]
+    return errors_of(obj, transports, **sampling)[model]
 
 
 def transport_of(obj: TranslucentObject, model: str, folder: str | os.PathLike | None = None) -> Transport:

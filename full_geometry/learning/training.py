@@ -29,7 +29,7 @@ from full_geometry.learning.model_errors import (
 )
 from full_geometry.learning.network_fitting import PROPOSED, STANDARD, ObjectFit, Recipe
 from full_geometry.objects.objects import TranslucentObject, object_of
-from full_geometry.scenes.camera_walks import TRIAL
+from full_geometry.scenes.camera_walks import TRIAL, CameraWalks
 from full_geometry.transport import storing
 from full_geometry.transport.exit_pairs import EntryProposals, Pairs, PairSource, WalkExits, shuffled
 from full_geometry.transport.features import n_local, n_pair, n_side
@@ -120,12 +120,12 @@ class CameraExits:
 
     Args:
         source: of the pairs.
-        camera: a `CameraWalks`.
+        camera: walks from the camera.
         walks: of a chunk, those of the camera included.
         seed: of the run.
     """
 
-    def __init__(self, source: PairSource, camera: Any, walks: int, seed: int) -> None:
+    def __init__(self, source: PairSource, camera: CameraWalks, walks: int, seed: int) -> None:
         self.source, self.camera, self.walks, self.seed = source, camera, walks, seed
         self.shape = source.object.geometry.shape
         self.schedule = CameraSchedule.of(walks, camera.hits(self.shape), camera.pixels)
@@ -218,23 +218,48 @@ class Trained:
     seconds: float
 
 
+@dataclass(frozen=True)
+class TrainingPlan:
+    """How long, how large and from where a training goes.
+
+    Args:
+        seconds: for data, fit and validation, after the kernels are compiled; 0 gives the base model, with a warning.
+        target_error: stop once the largest error under constant light has come down to it.
+        seed: of everything.
+        recipe: sizes and rates.
+        chunks: number of chunks instead of a plan by time.
+        base_model: `neural_shape` or a half-space model, with its rate; by default the recipe's.
+        refine: begin from the weights of the same shape with the medium that is most alike, see `storing.nearest`.
+    """
+
+    seconds: float = 60.0
+    target_error: float | None = None
+    seed: int = 0
+    recipe: Recipe = STANDARD
+    chunks: int | None = None
+    base_model: str | None = None
+    refine: bool = False
+
+    def __post_init__(self) -> None:
+        check_interval("seconds", self.seconds, 0.0, 1e7)
+        check_count("seed", self.seed, 0)
+        if self.target_error is not None:
+            check_interval("target_error", self.target_error, 1e-4, 1.0)
+        if self.chunks is not None:
+            check_count("chunks", self.chunks, 1)
+
+
 def train(
-    shape: Any,
+    shape: mi.Shape | mi.Scene | TranslucentObject,
     medium: Medium | None = None,
     *,
     mm_per_unit: float | None = None,
     object: str | None = None,
-    seconds: float = 60.0,
-    target_error: float | None = None,
-    seed: int = 0,
-    recipe: Recipe = STANDARD,
-    chunks: int | None = None,
     folder: str | Path | None = None,
     work: str | Path | None = None,
-    camera: Any = None,
+    camera: CameraWalks | None = None,
     progress: Progress | None = None,
-    base_model: str | None = None,
-    refine: bool = False,
+    **plan: Any,
 ) -> Trained:
     """Learn S of an object and write its weights.
 
@@ -246,44 +271,33 @@ def train(
         medium: 1/mm, scalar or one value per channel; of a scene it is that of the object's `translucent` surface.
         mm_per_unit: length of a scene unit, mm; by default what the integrator of a scene says, and 1 for a shape.
         object: id of the object in a scene; may be left out where there is one.
-        seconds: for data, fit and validation, after the kernels are compiled; 0 gives the base model, with a warning.
-        target_error: stop once the largest error under constant light has come down to it.
-        seed: of everything.
-        recipe: sizes and rates.
-        chunks: number of chunks instead of a plan by time.
         folder: for the weights; by default HALFSPACE_SSS_WEIGHTS or the user's data folder.
         work: folder for unfinished work.
-        camera: a `CameraWalks`, whose walks join those of random exits.
+        camera: walks from the camera, which join those of random exits.
         progress: called with (what, done, total).
-        base_model: `neural_shape` or a half-space model, with its rate; by default the recipe's.
-        refine: begin from the weights of the same shape with the medium that is most alike, see `storing.nearest`.
+        plan: fields of `TrainingPlan`.
 
     Raises:
         ValueError: an argument is out of range, there are no weights to refine, or `work` is of another run; nothing
             has been traced then.
     """
     obj = shape if isinstance(shape, TranslucentObject) else object_of(shape, medium, mm_per_unit, object)
-    check_interval("seconds", seconds, 0.0, 1e7)
-    check_count("seed", seed, 0)
-    if target_error is not None:
-        check_interval("target_error", target_error, 1e-4, 1.0)
-    if chunks is not None:
-        check_count("chunks", chunks, 1)
+    how = TrainingPlan(**plan)
     folder = check_weights_folder(folder)
     if work is not None:
         check_folder(work)
     if not any(float(m.sigma_s) > 0 for m in obj.media):
         raise ValueError("medium must scatter in at least one channel to be learnt, got sigma_s 0 in all")
-    recipe = recipe if base_model is None else recipe.with_base_model(base_model)
-    start = storing.nearest(obj, asdict(recipe), folder) if refine else None
-    if refine and start is None:
+    recipe = how.recipe if how.base_model is None else how.recipe.with_base_model(how.base_model)
+    start = storing.nearest(obj, asdict(recipe), folder) if how.refine else None
+    if how.refine and start is None:
         raise ValueError(f"refine must have weights of the same shape and a medium alike in {folder}, got none")
     recipe = recipe if start is None else recipe.refining()
-    run = _ObjectTraining(obj, recipe, int(seed), Path(work) if work else None, camera, start)
-    if seconds == 0:
+    run = _ObjectTraining(obj, recipe, int(how.seed), Path(work) if work else None, camera, start)
+    if how.seconds == 0:
         warnings.warn(f"an object that is trained for 0 seconds is rendered by {recipe.base_model}", stacklevel=2)
         return Trained(*run.learnt(), None, [], 0, 0.0)
-    return run.go(seconds, chunks, target_error, folder, progress)
+    return run.go(how.seconds, how.chunks, how.target_error, folder, progress)
 
 
 def train_by_cpu(
@@ -323,7 +337,7 @@ class _ObjectTraining:
         recipe: Recipe,
         seed: int,
         work: Path | None,
-        camera: Any,
+        camera: CameraWalks | None,
         start: storing.Neighbour | None = None,
     ) -> None:
         self.start = start

@@ -22,7 +22,7 @@ from full_geometry.surface.wrapped import surface_of
 from full_geometry.transport.models import model_names, of_objects
 from halfspace_sss.interrupts import is_interrupt
 
-_HERE = str(Path(__file__).parents[3])
+_HERE = str(Path(__file__).parents[2])
 
 _PLACE = re.compile(r"(?:At|While loading) (?:dictionary node )?(.+? \(line \d+, col \d+\)|\S+): ")
 _SOURCE = re.compile(r"^\[[\w.]+:\d+\] ")
