@@ -1,4 +1,4 @@
-"""What the user may set on the integrator, checked before a scene is touched."""
+"""Settings of the integrators, checked before a scene is touched."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Settings:
             check_interval("area_share", self.area_share, 0.0, 1.0)
 
     def shared(self) -> dict[str, Any]:
-        """What `translucent_walk` understands too."""
+        """The settings that `translucent_walk` understands too."""
         return {name: getattr(self, name) for name in SHARED}
 
     def of_models(self) -> dict[str, Any]:

@@ -59,7 +59,7 @@ def object_digest(node: mi.Object) -> str:
 
 
 def words(result: object) -> str:
-    """What an object tells of itself, to the last digit where Python prints it."""
+    """The text of an object by `str`, with all digits where Python prints it."""
     with np.printoptions(precision=17, threshold=sys.maxsize):
         return _LEFT_OUT.sub("", _MADE_UP.sub("", str(result)))
 

@@ -51,7 +51,7 @@ class Group:
 
     @functools.cached_property
     def longest(self) -> float:
-        """By how much an instance makes a length larger, at most."""
+        """The largest factor by which an instance stretches a length."""
         return float(np.linalg.norm(self.to_world[:, :3, :3], ord=2, axis=(1, 2)).max())
 
     @functools.cached_property
@@ -66,7 +66,7 @@ class Group:
 
     @functools.cached_property
     def rounding(self) -> np.ndarray:
-        """Of each instance a bound of how far from surfaces rounding puts points, scene units."""
+        """A bound for each instance of how far rounding puts points off its surfaces, scene units."""
         return np.max([_rounding(shape, self.to_world) for shape in self.shapes], axis=0)
 
 
@@ -127,7 +127,7 @@ class InstanceTable:
         return np.repeat(np.arange(len(self.shapes)), np.diff(self.first))
 
     def numbers(self, kind: int) -> range:
-        """Of the things of a shape."""
+        """The numbers of a shape and its instances."""
         return range(int(self.first[kind]), int(self.first[kind + 1]))
 
     def to_world(self, kind: int) -> np.ndarray:
@@ -143,12 +143,12 @@ class InstanceTable:
 
     @functools.cached_property
     def rounding(self) -> np.ndarray:
-        """Of each thing a bound of how far from its surface rounding puts points, scene units."""
+        """A bound for each number of how far rounding puts points off its surface, scene units."""
         return np.concatenate([_rounding(shape, self.to_world(kind)) for kind, shape in enumerate(self.shapes)])
 
     @functools.cached_property
     def tables(self) -> dict[str, mi.Int32 | mi.UInt32]:
-        """By what Dr.Jit's registry calls a shape the number of its `first` thing or -1; of an instance its `rank`."""
+        """Tables by pointers of Dr.Jit's registry: the `first` number of a shape or -1, the `rank` of an instance."""
         ranks = {id(g): np.arange(len(g.instances)) for g in self.groups if g is not None}
         shown = {id(g): g.instances for g in self.groups if g is not None}
         instances = [mi.ShapePtr(each) for group in shown.values() for each in group]
@@ -168,20 +168,20 @@ class InstanceTable:
 
 
 def _rounding(shape: mi.Shape, to_world: np.ndarray) -> np.ndarray:
-    """Under each of the transformations a bound of how far from a shape rounding puts points."""
+    """A bound under each transformation of how far rounding puts points off a shape."""
     there = bounds(shape, *ends_of(corners(shape.bbox(), to_world)))
     return np.maximum(there, bound_of(shape) * np.linalg.norm(to_world[:, :3, :3], ord=2, axis=(1, 2)))
 
 
 def corners(box: mi.ScalarBoundingBox3f, to_world: np.ndarray) -> np.ndarray:
-    """Of a box under each of the transformations (n, 4, 4) its corners, shape (n, 3, 8)."""
+    """The corners of a box under each of the transformations (n, 4, 4), shape (n, 3, 8)."""
     ends = np.stack([np.ravel(np.array(end, dtype=float)) for end in (box.min, box.max)])
     points = np.stack(np.meshgrid(*ends.T, indexing="ij")).reshape(3, 8)
     return to_world[:, :3, :3] @ points + to_world[:, :3, 3:]
 
 
 def ends_of(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of sets of points (n, 3, m) the least and the largest coordinates, shapes (n, 3)."""
+    """The least and the largest coordinates of sets of points (n, 3, m), shapes (n, 3)."""
     return points.min(axis=2), points.max(axis=2)
 
 
@@ -269,7 +269,7 @@ class InstanceScene:
 
     @classmethod
     def of(cls, scene: mi.Scene, shown: Sequence[Group]) -> InstanceScene:
-        """Of a scene that shows these groups."""
+        """Make the tables of a scene whose instances show these groups."""
         known, lamps = bounds_of(scene.shapes(), shown), lamps_of(scene)
         if not shown:
             return cls([], {}, known, lamps)
@@ -277,7 +277,7 @@ class InstanceScene:
 
     @classmethod
     def of_shapes(cls, shapes: list[mi.Shape], shown: Sequence[Group] = ()) -> InstanceScene:
-        """Of shapes, those of groups last."""
+        """Make the tables of shapes, those of groups last."""
         instances = [mi.ShapePtr(each) for group in shown for each in group.instances]
         M = np.concatenate([np.eye(4)[None], *(group.to_world for group in shown)])
         pointers = [mi.ShapePtr(each) for each in shapes]
@@ -318,7 +318,7 @@ class InstanceScene:
     def intersect(
         self, scene: mi.Scene, ray: mi.Ray3f, flags: int, coherent: bool = False, active: mi.Bool | bool = True
     ) -> mi.SurfaceInteraction3f:
-        """What a ray meets in a scene of the shapes."""
+        """Intersect a ray with a scene of the shapes, as `mi.Scene.ray_intersect`."""
         if not self.shapes:
             return scene.ray_intersect(ray, flags, coherent, active)
         hit = scene.ray_intersect_preliminary(ray, coherent, active=active)
@@ -327,7 +327,7 @@ class InstanceScene:
     def interaction(
         self, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, flags: int, active: mi.Bool | bool = True
     ) -> mi.SurfaceInteraction3f:
-        """What a ray has met."""
+        """The interaction of an intersection that is known."""
         if not self.shapes:
             return hit.compute_surface_interaction(ray, flags, active)
         active = active & hit.is_valid()
@@ -415,23 +415,23 @@ class InstanceProposals:
     transform: InstanceTransform
 
     def prepare(self, out: SurfacePoint, prepared: Any, active: mi.Bool) -> Any:
-        """As of the proposals."""
+        """Prepare the proposals at the exit in the frame of the group."""
         return self.proposals.prepare(self.transform.surface_point_to_object(out), prepared, active)
 
     def sample(
         self, out: SurfacePoint, prim_index: mi.UInt32, prepared: Any, sampler: mi.Sampler, active: mi.Bool
     ) -> EntrySample:
-        """As of the proposals."""
+        """Draw an entry in the frame of the group, and move it to the scene."""
         return self.transform.entry_to_world(
             self.proposals.sample(self.transform.surface_point_to_object(out), prim_index, prepared, sampler, active)
         )
 
     def sample_direction(self, entry: EntrySample, out: SurfacePoint, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
-        """As of the proposals, which ask for both ends alone."""
+        """Draw a direction as the proposals do: they need the normals of both ends alone."""
         return self.proposals.sample_direction(entry, out, u)
 
     def pdf_direction(self, entry: EntrySample, out: SurfacePoint, w_i: mi.Vector3f) -> mi.Float:
-        """As of the proposals."""
+        """The density of `sample_direction`, 1/sr."""
         return self.proposals.pdf_direction(entry, out, w_i)
 
 
@@ -450,11 +450,11 @@ class InstanceTransport(TransportAround):
         return None if self.transport.alpha is None else InstanceAlbedo(self.transport.alpha, self.transform)
 
     def prepare(self, at: SurfacePoint, active: mi.Bool = True) -> Any:
-        """As of the transport."""
+        """Prepare the transport at the exit in the frame of the group."""
         return self.transport.prepare(self.transform.surface_point_to_object(at), active)
 
     def S(self, exit: Any, at: SurfacePoint, active: mi.Bool = True) -> mi.Spectrum:
-        """As of the transport."""
+        """S of the transport for the entry in the frame of the group."""
         return self.transport.S(exit, self.transform.surface_point_to_object(at), active)
 
 
@@ -470,5 +470,5 @@ class InstanceAlbedo:
         return self.alpha.known
 
     def __call__(self, at: SurfacePoint, active: mi.Bool) -> tuple[mi.Spectrum, mi.Spectrum]:
-        """As of the shape."""
+        """The directional albedo at the exit in the frame of the group."""
         return self.alpha(self.transform.surface_point_to_object(at), active)

@@ -311,7 +311,7 @@ class Proposals(Protocol):
         return self
 
     def prepare(self, out: SurfacePoint, prepared: Any, active: mi.Bool) -> Any:
-        """What is done once for all entries of an exit; `prepared` is what the transport has made of it."""
+        """Prepare an exit once for all its entries; `prepared` comes from `Transport.prepare`."""
 
     def sample(
         self, out: SurfacePoint, prim_index: mi.UInt32, prepared: Any, sampler: mi.Sampler, active: mi.Bool
@@ -348,7 +348,7 @@ class ObjectAlbedo(Protocol):
     known: tuple[mi.Spectrum, mi.Spectrum]
 
     def __call__(self, at: SurfacePoint, active: mi.Bool) -> tuple[mi.Spectrum, mi.Spectrum]:
-        """Of orders below two and of S at an exit, per channel; 0 where it is not known."""
+        """The directional albedos of orders below two and of S at an exit, per channel; 0 where they are not known."""
 
 
 class Transport(Protocol):
@@ -367,7 +367,7 @@ class Transport(Protocol):
     is_delta: bool
 
     def prepare(self, at: SurfacePoint, active: mi.Bool = True) -> Any:
-        """What is done once for all entries of an exit, handed to `S` as it is."""
+        """Prepare an exit once for all its entries; the result is handed to `S`."""
 
     def S(self, exit: Any, at: SurfacePoint, active: mi.Bool = True) -> mi.Spectrum:
         """S(x_i, w_i; x_o, w_o) per channel, 1/((scene unit)² sr); 0 below the horizons.
@@ -384,7 +384,7 @@ class Transport(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class TransportAround:
-    """What a transport around another one has of it.
+    """A transport that wraps another one and takes its properties.
 
     Args:
         transport: the other one.
@@ -407,7 +407,7 @@ class TransportAround:
 
 
 class ObjectModel(NamedTuple):
-    """What renders an object inside: a transport, the proposals that suit it, and how many entries an exit draws."""
+    """The model of an object: a transport, the proposals that suit it, and how many entries an exit draws."""
 
     transport: Transport | None
     proposals: Proposals | None
@@ -453,7 +453,7 @@ class PositionSampler:
         return int(self.area_share < 1)
 
     def _side(self, out: SurfacePoint, prim_index: mi.UInt32, active: mi.Bool) -> mi.Float:
-        """What turns the normal of a face outwards: of a sheet, to the side of the exit."""
+        """The sign that turns the normal of a face outwards, or that of a sheet to the side of the exit."""
         return self.geometry.side(prim_index, active) if self.geometry.closed else out.sign
 
     def density(

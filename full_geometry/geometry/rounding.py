@@ -37,12 +37,12 @@ def bound_of(shape: mi.Shape) -> float:
 
 
 def place_bound(p: mi.Point3f) -> mi.Float:
-    """What float32 takes from a point that no shape is known of."""
+    """A bound of the rounding of a point in float32, for a point of no known shape."""
     return OF_PLACE * EPSILON * dr.sum(dr.abs(p))
 
 
 def clear(n: mi.Normal3f, d: mi.Vector3f, e: mi.Float | float) -> mi.Vector3f:
-    """From a point with the normal n to where a ray along d is clear of its surface."""
+    """The offset from a point with the normal n to where a ray along d is clear of its surface."""
     return mi.Vector3f(n) * dr.mulsign(mi.Float(e), dr.dot(n, d))
 
 

@@ -206,7 +206,7 @@ class Geometry:
 
     @property
     def name(self) -> str:
-        """What messages call it."""
+        """The name of the shape in messages."""
         return name_of(self.shape)
 
     def is_current(self) -> bool:
@@ -237,7 +237,7 @@ class Geometry:
     def ray_intersect(
         self, ray: mi.Ray3f, flags: int, coherent: bool = False, active: mi.Bool | bool = True
     ) -> mi.SurfaceInteraction3f:
-        """What a ray meets of the shape alone."""
+        """Intersect a ray with the shape alone, as `mi.Scene.ray_intersect`."""
         if self.group is None:
             return self.scene.ray_intersect(ray, flags, coherent, active)
         if self.transform is None:
@@ -330,7 +330,7 @@ PLACES = (*mesh.GEOMETRY, "to_world", "grid", "control_points", "data", "extent"
 
 
 def geometry_of(shape: mi.Shape) -> Snapshot:
-    """What tells one geometry of a shape from the next."""
+    """A snapshot of the parameters that say where a shape is."""
     return Snapshot.of(shape, PLACES.__contains__)
 
 
@@ -341,7 +341,7 @@ def matrix_of(to_world: mi.Transform4f) -> np.ndarray:
 
 
 class _Votes:
-    """Of the hits on each piece, how many say that its normals point outwards: against a ray that enters.
+    """Votes of hits on each piece: the normals point outwards if they are against a ray that enters.
 
     A ray from outside enters a closed object with its first, third, ... hit, whatever hides the piece.
     """
@@ -376,7 +376,7 @@ class _Votes:
         return len(shares) > 0 and bool((np.abs(shares - 0.5) >= MAJORITY - 0.5).all())
 
     def signs(self) -> mi.Float | None:
-        """Of each face, or None if all pieces have the same."""
+        """The sign of each face, or None if it is the same for all."""
         if self.pieces is None:
             return None
         sign = np.where(self._shares() < 0.5, -1.0, 1.0)[np.array(self.pieces)]
@@ -411,7 +411,7 @@ def crossings(scene: mi.Scene, ray: mi.Ray3f, votes: _Votes | None = None) -> tu
 
 
 def meet_alone(scene: mi.Scene, ray: mi.Ray3f, flags: int, active: mi.Bool | bool = True) -> mi.SurfaceInteraction3f:
-    """What a ray meets in a scene of one shape, by the function of this shape.
+    """Intersect a ray with a scene of one shape, by the function of this shape.
 
     Mitsuba would have functions of all shapes that exist in the kernel, those of other scenes too; of a thousand
     instances that takes minutes.
@@ -497,7 +497,7 @@ def by_pointer(pointers: list[Pointer], values: np.ndarray, otherwise: int) -> m
 
 
 def pointer_numbers(pointers: Iterable[Pointer]) -> list[int]:
-    """What Dr.Jit's registry calls each."""
+    """The number of each pointer in Dr.Jit's registry."""
     return [int(dr.reinterpret_array(mi.UInt32, pointer)[0]) for pointer in pointers]
 
 

@@ -1,4 +1,4 @@
-"""What objects of Mitsuba and their parameters are at one moment, so that an edit is seen later.
+"""Snapshots of objects of Mitsuba and their parameters, by which a later edit is seen.
 
 Values count, by checksums of their bytes. The numbers that Dr.Jit gives to its variables tell nothing: they are given
 again once a variable is freed. Neither would values that are kept: NumPy's views of them write into them.
@@ -27,7 +27,7 @@ class Snapshot:
     def of(
         cls, root: mi.Object, wanted: Callable[[str], bool] | None = None, without: tuple[type, ...] = ()
     ) -> Snapshot:
-        """Of an object and all that it holds.
+        """Take the snapshot of an object and all that it holds.
 
         Args:
             root: of Mitsuba.

@@ -91,13 +91,13 @@ class FitStep(NamedTuple):
     values: dict[str, list[float]]
 
     def line(self) -> str:
-        """For the progress."""
+        """A line for the progress."""
         numbers = "; ".join(f"{name} {' '.join(f'{v:.4g}' for v in value)}" for name, value in self.values.items())
         return f"loss {self.loss:.3g} ± {self.error:.1g}  {numbers}"
 
 
 class ChiSquare(NamedTuple):
-    """Of means of residuals over neighbouring pixels, per degree of freedom: 1 if residuals are noise of each pixel.
+    """chi² of means of residuals over neighbouring pixels, per degree of freedom: 1 if each pixel has noise of its own.
 
     With residuals z of pixels p in a standard of their own, sums over pixels q further away than `NEAR` and as near as
     `FAR_OFF`, and correlations c of pixels as near as `NEAR`,
@@ -117,7 +117,7 @@ class ChiSquare(NamedTuple):
 
     @classmethod
     def of(cls, residuals: Sequence[np.ndarray]) -> ChiSquare:
-        """Of images (height, width, channels), 0 where nothing counts."""
+        """The chi² of residuals (height, width, channels), which are 0 where nothing counts."""
         far, variance, squares = 0.0, 0.0, 1e-30
         shifts = [(i, j) for i in range(-NEAR, NEAR + 1) for j in range(-NEAR, NEAR + 1)]
         near = np.zeros(len(shifts))
@@ -170,7 +170,7 @@ class FittedView(NamedTuple):
 
 @dataclass(frozen=True)
 class MaterialFit:
-    """What was found.
+    """The result of a fit.
 
     Args:
         values: of each parameter that is the same everywhere; sigma_t in 1/mm, mfp in mm.
@@ -284,7 +284,7 @@ class ViewComparison:
         return max(float(view.counts.sum() * view.image.shape[2]), 1.0)
 
     def seed(self, k: int, which: int, purpose: str, parameter: int = 0) -> int:
-        """Of the samples of a render in a step."""
+        """The seed of a render in step k."""
         words = [self.settings.seed, k, which, PURPOSES.index(purpose), parameter]
         return int(np.random.SeedSequence(words).generate_state(1)[0])
 
@@ -409,7 +409,7 @@ class ViewComparison:
         self.factors[which] = np.clip(factor, 1 / EXPOSURE, EXPOSURE)
 
     def fingerprint(self, *start: object) -> str:
-        """Of the images, the settings, where a fit starts, and versions."""
+        """A hash of the images, the settings, the start of a fit, and versions."""
         views = [(v.sensor, v.held_out) for v in self.views]
         told = provenance()
         of = [asdict(self.settings), start, views, told["versions"], told["commit"]]
@@ -447,7 +447,7 @@ class FitDescent(Protocol):
         """Go back to such a state."""
 
     def fingerprint(self) -> str:
-        """Of what is fitted to what, how, and from where."""
+        """A hash of what is fitted to what, how, and from where."""
 
 
 def kept_at(change: np.ndarray | float) -> np.ndarray | float:

@@ -289,7 +289,7 @@ class MediumDescent:
         )  # fmt: skip
 
     def _residual(self, which: int) -> tuple[np.ndarray, np.ndarray]:
-        """What is left of a view by the means of its renders, where they count; and that by the root of its weights."""
+        """The residual e I - T of a view by the means of its renders, and its product with the root of the weights."""
         means, view, e = self.means[which], self.comparison.views[which], self.comparison.exposures[which]
         x = np.concatenate([_numbers(each) for each in self.x.values()])
         image = means.image / np.maximum(means.weights, 1e-30) + means.J @ (x - means.x)
@@ -297,7 +297,7 @@ class MediumDescent:
         return left, (left * np.sqrt(means.weights)).reshape(view.image.shape)
 
     def _covariance(self, alike: float, common: bool = False) -> np.ndarray:
-        """Of the variables, by residuals of all pixels, H^-1 (sum w² r² J^T J) H^-1: noise of images and of renders.
+        """The covariance of the variables by residuals r of all pixels, H^-1 (sum w² r² J^T J) H^-1.
 
         Args:
             alike: factor by which the variance of means is larger, where noise of neighbouring pixels is alike.
@@ -360,7 +360,7 @@ def _numbers(x: mi.Float | mi.Spectrum) -> np.ndarray:
 
 
 def _ambiguity(values: dict[str, np.ndarray], correlation: np.ndarray) -> list[str]:
-    """What images cannot tell apart: sigma_t and g, beyond sigma_t (1 - g)."""
+    """A sentence on what images cannot tell apart: sigma_t and g, beyond sigma_t (1 - g)."""
     extent = next((name for name in ("sigma_t", "mfp") if name in values), None)
     if extent is None or "g" not in values:
         return []

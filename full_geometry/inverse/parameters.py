@@ -1,4 +1,4 @@
-"""What is fitted of a medium, in variables without bounds: logit albedo, log sigma_t or mfp, artanh g."""
+"""Parameters of a medium that are fitted, as variables without bounds: logit albedo, log sigma_t or mfp, artanh g."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def size_bounds(shape: mi.Shape, mm_per_unit: float) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class FitParameters:
-    """What is fitted of one object.
+    """The parameters of one object that are fitted.
 
     Args:
         names: of `NAMES`.
@@ -107,7 +107,7 @@ class FitParameters:
 
     @classmethod
     def of(cls, names: Sequence[str], shape: mi.Shape, mm_per_unit: float) -> FitParameters:
-        """Of an object.
+        """Choose the parameters of an object by name.
 
         Raises:
             ValueError: a name is unknown or there twice, sigma_t and mfp are both asked for, or the medium varies.
@@ -132,7 +132,7 @@ class FitParameters:
         return result
 
     def bounds(self, name: str) -> tuple[float, float]:
-        """Of a variable."""
+        """The bounds of a variable."""
         if name == "albedo":
             return tuple(float(np.log(a / (1 - a))) for a in ALBEDO)
         if name == "g":

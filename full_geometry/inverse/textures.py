@@ -136,7 +136,7 @@ class Variable:
         return G - v**2 / G if self.name == "g" else v
 
     def numbers(self, x: np.ndarray) -> mi.Float | mi.Spectrum | mi.TensorXf:
-        """What stands in the scene."""
+        """The numbers that stand in the scene for variables."""
         numbers = (self.parameter(x) / self.factor).astype(np.float32)
         value = self.kind(numbers.reshape(self.start.shape)) if self.start.ndim == 3 else self.kind(numbers.tolist())
         dr.make_opaque(value)  # as literals they would be code, and each step would compile anew
@@ -157,7 +157,7 @@ class Variable:
 
     @functools.cached_property
     def differences(self) -> csr_array:
-        """Of neighbours, shape (pairs, texels)."""
+        """The matrix of differences of neighbours, shape (pairs, texels)."""
         m = len(self.pairs) if self.pairs is not None else 0
         i, j = self.pairs.T if m else (np.zeros(0, int),) * 2
         values = np.r_[np.ones(m), -np.ones(m)]
@@ -188,7 +188,7 @@ class Variable:
         return np.array(mesh.vertices_of(shape, si.prim_index), dtype=int), np.stack([1 - u - v, u, v])
 
     def _texels_at(self, si: mi.SurfaceInteraction3f) -> tuple[np.ndarray, np.ndarray]:
-        """Of a bitmap, by what it shows of texels that are no neighbours: weights, and these times rows and columns."""
+        """`places` of a bitmap, read off what it shows when texels that are no neighbours hold known numbers."""
         parameters = mi.traverse(self.texture)
         kept, (rows, columns, channels) = parameters["data"], self.start.shape
         most = max(rows, columns)  # numbers are shown over that, as colours are at most 1
@@ -220,7 +220,7 @@ class Variable:
 
 @dataclass(frozen=True, eq=False)
 class TextureParameters:
-    """What is fitted of one object with textures.
+    """The textures and constants of one object that are fitted.
 
     Args:
         shape: the object.
@@ -232,7 +232,7 @@ class TextureParameters:
 
     @classmethod
     def of(cls, names: Sequence[str], shape: mi.Shape, mm_per_unit: float, scene: mi.Scene) -> TextureParameters:
-        """Of an object.
+        """Choose the parameters of an object by name.
 
         Raises:
             ValueError: a name is unknown, there twice, or of another medium than the object's; a texture is neither a
@@ -502,7 +502,7 @@ class TextureDescent:
         return result
 
     def _points(self, number: int) -> tuple[np.ndarray, mi.SurfaceInteraction3f, mi.Point2f]:
-        """Of rays of a camera that meet the object: their pixels, where they do, and where in the face."""
+        """Pixels, interactions and barycentric coordinates of the rays of a camera that meet the object."""
         scene, sensor = self.comparison.scene, self.comparison.scene.sensors()[number]
         film, ray = sensor.film(), camera_rays(sensor, RAYS, (self.comparison.settings.seed, number))
         width, height = (int(n) for n in film.crop_size())
@@ -611,7 +611,7 @@ class TextureDescent:
         ]
 
     def _told(self, v: Variable, x: np.ndarray, error: np.ndarray) -> list[str]:
-        """What is at a bound, and what no view sees."""
+        """Sentences on variables at a bound and texels that no view sees."""
         told, dark = [], np.isnan(error.reshape(v.texels, -1)).any(axis=1)
         if n := v.at_bound(x):
             told.append(f"{n} of {x.size} variables of {v.name} are at a bound")

@@ -43,7 +43,7 @@ class GivenView:
 
     @classmethod
     def of(cls, name: str, sensor: int, image: Any, mask: Any = None, held_out: bool = False) -> GivenView:
-        """From an image of any kind; `mask` is > 0.5 where pixels count.
+        """Check an image of any kind; pixels count where `mask` is > 0.5.
 
         Raises:
             ValueError: a pixel that counts is not finite, none counts, those that do are dark or below 0 in their mean,

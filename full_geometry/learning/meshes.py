@@ -209,13 +209,13 @@ class Mesh:
 
     @property
     def areas(self) -> np.ndarray:
-        """Of each triangle, mm²."""
+        """The area of each triangle, mm²."""
         a, b, c = np.moveaxis(self.vertices[self.faces], 1, 0)
         return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
     @property
     def volume(self) -> float:
-        """Of what the surface encloses, mm³: sum of a.(b x c) / 6."""
+        """The volume that the surface encloses, mm³: the sum of a.(b x c) / 6."""
         a, b, c = np.moveaxis(self.vertices[self.faces], 1, 0)
         return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
 

@@ -53,11 +53,11 @@ class DenseLayers(nn.Module):
             self.biases.append(torch.zeros(j, 1))
 
     def forward(self, x: torch.Tensor, first: torch.Tensor | None = None) -> torch.Tensor:
-        """Of columns x; `first` takes the place of the first matrix."""
+        """The outputs for columns x; `first` takes the place of the first matrix."""
         return torch.addmm(self.biases[-1], self.matrices[-1], self.units(x, first))
 
     def units(self, x: torch.Tensor, first: torch.Tensor | None = None) -> torch.Tensor:
-        """What the last layer is told."""
+        """The inputs of the last layer."""
         matrices = list(self.matrices) if first is None else [first, *self.matrices[1:]]
         for W, b in list(zip(matrices, self.biases))[:-1]:
             x = nn.functional.hardswish(torch.addmm(b, W, x))
@@ -387,7 +387,7 @@ class ObjectFit:
         return tensor(array, self.device)
 
     def _f(self, x: torch.Tensor, back: bool = False, of: torch.nn.ModuleDict | None = None) -> torch.Tensor:
-        """Of features of pairs: S knows the directional albedos of both ends."""
+        """f of the features x of pairs: S knows the directional albedos of both ends."""
         of = of or self.modules
         return of["S"](of["alpha"].joined(x), back)
 
@@ -407,7 +407,7 @@ class ObjectFit:
             return y[:, kept], W[:, kept] * (len(kept) / len(p)) / p[kept]
 
     def _patch_loss(self, x: torch.Tensor, T: torch.Tensor, patch: torch.Tensor) -> torch.Tensor:
-        """Of a part of a batch."""
+        """The loss of the logits of patches on a part of a batch."""
         T = T[:, :PATCH_BATCH].mean(dim=0)
         return patch_likelihood(self.modules["patches"](x[: self.n_side, :PATCH_BATCH]), T, patch[:PATCH_BATCH])
 
@@ -484,7 +484,7 @@ class Ends:
         self.curve = torch.eye(p, device=device).repeat(channels, 1, 1)  # H
 
     def tensors(self) -> dict[str, torch.Tensor]:
-        """What is known of walks, by name."""
+        """The arrays of walks, by name."""
         return {f"ends.{name}": getattr(self, name) for name in ("walked", "of_T", "drawn")}
 
     def add_walks(self, x: torch.Tensor, T: torch.Tensor, drawn: int) -> None:

@@ -1,4 +1,4 @@
-"""What came of a training, and how wrong a model of an object is, as commands print them."""
+"""Records of a training and of the errors of a model of an object, as commands print them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class ObjectError(NamedTuple):
 
 
 class LearntObject(NamedTuple):
-    """What came of a training: where its weights lie (None: there are none), how wrong they are, and its cost."""
+    """The result of a training: the file of its weights (None: there are none), their errors, and the cost."""
 
     object: str
     path: Path | None
@@ -29,7 +29,7 @@ class LearntObject(NamedTuple):
 
 
 class LearntShapes(NamedTuple):
-    """What came of a training on shapes without end: where its weights lie, objects that were drawn, and its cost."""
+    """The result of a training on random shapes: the file of its weights, the number of objects, and the cost."""
 
     path: Path
     objects: int

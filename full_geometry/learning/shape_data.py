@@ -43,7 +43,7 @@ class Drawn:
     object: TranslucentObject
 
     def record(self) -> dict[str, Any]:
-        """What it is, ready for JSON."""
+        """The object as JSON has it."""
         m = self.object.media[0]
         size = float(self.object.mean_free_paths()[0])
         return {"family": self.family, "size_in_mfp": size, "albedo": float(m.albedo), "g": float(m.g), "eta": m.eta}
@@ -133,12 +133,12 @@ class PairData:
     share: float
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """For a file."""
+        """The arrays for a file."""
         return {name: np.asarray(getattr(self, name)) for name in NAMES}
 
     @classmethod
     def from_arrays(cls, arrays: Any) -> PairData:
-        """From a file; KeyError if it is another one."""
+        """Read pairs from the arrays of a file; KeyError if it is another one."""
         stored = {name: arrays[name] for name in NAMES}
         return cls(**{**stored, "share": float(stored["share"])})
 

@@ -101,12 +101,12 @@ class CameraSchedule(NamedTuple):
     every: int
 
     def numbers(self, k: int) -> list[int]:
-        """Of the passes of chunk k."""
+        """Numbers of the passes of chunk k."""
         return [] if k % self.every else [k // self.every * self.passes + j for j in range(self.passes)]
 
     @classmethod
     def of(cls, walks: float, hits: int, pixels: int) -> CameraSchedule | None:
-        """For so many walks of a chunk, where `hits` of `pixels` paths meet the object; None if none do."""
+        """Plan so many walks of a chunk, where `hits` of `pixels` paths meet the object; None if none do."""
         if hits == 0:
             return None
         spp = min(SHARE * walks / hits, MOST_RAYS * SHARE * walks / pixels)
@@ -131,7 +131,7 @@ class CameraExits:
         self.schedule = CameraSchedule.of(walks, camera.hits(self.shape), camera.pixels)
 
     def seconds_more(self) -> float:
-        """Of a chunk in the mean, by the second one; compiles what passes need."""
+        """Seconds of a chunk in the mean, by the second one; compiles what passes need."""
         if self.schedule is None or self.schedule.every == 1:
             return 0.0
         for _ in range(2):
@@ -200,7 +200,7 @@ LOOP_SHARE = 0.83  # of the seconds for data and steps, the rest for pilot, solv
 
 @dataclass(frozen=True, eq=False)
 class Trained:
-    """What came of a training.
+    """The result of a training.
 
     Args:
         model: ready to be asked.
@@ -364,7 +364,7 @@ class _ObjectTraining:
         return ObjectFit(n_in, channels, self.object.media[0].eta, self.recipe, self.seed, self.patches)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """What is written: in half precision, but for what turns the inputs."""
+        """The arrays to be written: in half precision, but for what turns the inputs."""
         arrays = {name: value.astype(np.float16) for name, value in self.fitting.arrays().items()}
         arrays |= {storing.TRUSTED: self.trusted, storing.TURNS: self.frame.around.turns}
         return arrays if self.centres is None else {**arrays, storing.CENTRES: self.centres}
@@ -469,7 +469,7 @@ class _ObjectTraining:
             self._plan(max(int(LOOP_SHARE * seconds / each), 2))
 
     def _errors(self, truth: ExitTruth, samples: int) -> list[RadianceError]:
-        """Of the model as it stands; entries follow the patches, which have less noise than probes."""
+        """The errors of the model as it stands; entries follow the patches, which have less noise than probes."""
         model, sampler = self.learnt()
         by = self.proposals.with_patches(sampler)
         return measure(self.object, model, by, truth=truth, samples=samples, seed=self.seed)

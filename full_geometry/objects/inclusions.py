@@ -1,4 +1,4 @@
-"""What lies inside the objects of a scene: shapes or parts of them, lamps, and cameras, which may not.
+"""Inclusions, that is shapes, parts of shapes and lamps inside the objects of a scene; cameras may not be there.
 
 Shapes and objects may be instances. Copies of a shape and of an object whose boxes meet are looked at in pairs, in the
 frames of both, many pairs in a launch. In one group they are looked at once for all instances.
@@ -102,7 +102,7 @@ class _Pairs(NamedTuple):
     deep: np.ndarray
 
     def some(self, kept: np.ndarray | slice) -> _Pairs:
-        """Those that are kept."""
+        """The pairs that are kept."""
         return _Pairs(*(value[kept] for value in self))
 
 
@@ -229,7 +229,7 @@ def _tells(shape: mi.Shape) -> bool:
 
 
 def _rounding_of(instance_table: InstanceTable, kind: int) -> np.ndarray:
-    """Of the things of a shape, see `InstanceTable.rounding`; in a group looked at once for all, of the first."""
+    """`InstanceTable.rounding` of a shape and its instances."""
     return instance_table.rounding[instance_table.numbers(kind)]
 
 

@@ -80,7 +80,7 @@ class Inclusions:
 
     @classmethod
     def of(cls, result: list[Inclusion], world: mi.Scene, mm_per_unit: float) -> Inclusions:
-        """Of shapes in the scene `world`."""
+        """Make a scene of inclusions of the scene `world`."""
         shapes = [inclusion.node for inclusion in result]
         surfaces = [surface_of(shape) for shape in shapes]
         below = [surface and surface.spec for surface in surfaces]
@@ -89,7 +89,7 @@ class Inclusions:
 
     @property
     def shapes(self) -> list[mi.Shape]:
-        """In the order of the scene."""
+        """The shapes, in the order of the scene."""
         return [inclusion.node for inclusion in self.found]
 
     def is_current(self) -> bool:
@@ -173,7 +173,7 @@ def outermost(scene: mi.Scene) -> list[mi.Shape]:
 
 
 def places_of(scene: mi.Scene) -> list:
-    """What tells whether shapes, those of groups too, or lamps of a scene have been moved."""
+    """Snapshots of shapes, those of groups too, and places of lamps of a scene, by which a move is seen."""
     shapes = [node for node in mi.traverse(scene).hierarchy if isinstance(node, mi.Shape)]
     lamps = [place_of(emitter) for emitter in scene.emitters()]
     return [*map(geometry_of, shapes), *(None if place is None else place.tolist() for place in lamps)]
@@ -288,7 +288,7 @@ class TranslucentObject:
 
     @property
     def surface(self) -> mi.BSDF:
-        """Of one that is rendered its `translucent` surface, else the BSDF of its shape."""
+        """Its `translucent` surface; the BSDF of its shape where there is none."""
         return self.wrapping.surface
 
     @property
@@ -431,7 +431,7 @@ class Expected(NamedTuple):
 
 
 def expected_of(media: Sequence[Medium]) -> Expected:
-    """Of the media of the channels."""
+    """Means over the media of the channels."""
     rows = []
     for m in media:
         multiple = float(measure.reflectance(bssrdf("better_dipole", m), 1.0)) if float(m.sigma_s) > 0 else 0.0

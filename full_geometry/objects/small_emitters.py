@@ -122,7 +122,7 @@ class SmallEmitters:
 
     @classmethod
     def of(cls, scene: mi.Scene) -> SmallEmitters | None:
-        """Those of a scene; None if there are none.
+        """Find the small emitters of a scene; None if there are none.
 
         Raises:
             ValueError: as in `check_emitters`.

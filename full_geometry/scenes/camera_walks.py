@@ -94,7 +94,7 @@ class CameraWalks:
 
     @staticmethod
     def _number(media: WalkMedia, shape: mi.Shape) -> int:
-        """Of an object among those of the walk."""
+        """The number of an object among those of the walk."""
         (k,) = (k for k, obj in enumerate(media.objects) if obj.shape is shape or obj.shape.id() == shape.id())
         return k
 

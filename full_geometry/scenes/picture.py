@@ -11,7 +11,7 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """What is drawn of a render.
+    """A render to be drawn.
 
     Args:
         title: name of the scene and the model.

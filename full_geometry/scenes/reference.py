@@ -115,7 +115,7 @@ def _keep(path: Path, reference: Reference) -> None:
 
 @dataclass(frozen=True)
 class Limits:
-    """What ends a run, whichever comes first, and how it goes there; None is no limit.
+    """Limits of a run, the first of which ends it, and how it goes there; None is no limit.
 
     Args:
         spp: samples per pixel in all.
@@ -163,7 +163,7 @@ class Limits:
         return certain or any(limit is not None and value >= limit for limit, value in pairs)
 
     def share(self, reference: Reference) -> float:
-        """Of the work that is done, 0 to 1."""
+        """The share of the work that is done, 0 to 1."""
         pairs = ((reference.spp, self.spp), (reference.passes, self.passes), (reference.seconds, self.seconds))
         shares = [value / limit for value, limit in pairs if limit is not None]
         if self.target_error is not None and reference.passes > 1:
@@ -196,7 +196,7 @@ def _pass(
 
 
 def channel_names(film: mi.Film, integrator: mi.Integrator, channels: int) -> list[str]:
-    """What the channels of an image that `integrator` rendered to a film show; none of an image of colours alone.
+    """Names of the channels of an image that `integrator` rendered to a film; none of an image of colours alone.
 
     The integrator `aov` gives the images of those inside it, each with the colours of the film, then its own
     quantities, such as albedo.R; its film has four colours of each.
@@ -246,7 +246,7 @@ def check_sensor(scene: mi.Scene, sensor: int) -> None:
 
 
 def about_render(scene: mi.Scene, integrator: mi.Integrator, sensor: int, seed: int) -> dict[str, Any]:
-    """What tells one render from another, with its provenance."""
+    """The identity of a render, with its provenance."""
     about = {
         "scene": scene_hash(scene, integrator),
         "integrator": words(integrator),
@@ -258,7 +258,7 @@ def about_render(scene: mi.Scene, integrator: mi.Integrator, sensor: int, seed: 
 
 
 def chosen(scene: mi.Scene, integrator: mi.Integrator) -> dict[str, Any]:
-    """What was chosen for "auto" and why; it is chosen now if it has not been."""
+    """The choice of "auto" and its reasons; it is made now if it has not been."""
     if not is_bssrdf(integrator):
         return {}
     models = [surface.spec.model for surface in map(surface_of, translucent_shapes(scene))]
@@ -270,7 +270,7 @@ def chosen(scene: mi.Scene, integrator: mi.Integrator) -> dict[str, Any]:
 
 
 def _start(path: Path, resume: bool | str | os.PathLike, about: dict[str, Any]) -> Reference | None:
-    """What to go on with, if anything.
+    """The render to go on with, if there is one.
 
     Raises:
         ValueError: it is damaged or of another render.

@@ -46,7 +46,7 @@ class Reference:
 
     @property
     def standard_error(self) -> np.ndarray:
-        """Of the mean, per pixel and channel; infinite after fewer than two passes."""
+        """The standard error of the mean, per pixel and channel; infinite after fewer than two passes."""
         return np.sqrt(self.variance) if self.passes > 1 else np.full_like(self.mean, np.inf)
 
     @property
@@ -96,7 +96,7 @@ def _halves(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _names(channels: int, about: dict[str, Any]) -> list[str]:
-    """As `about` has them, where they and those of their parts are all different; else those of colours, or numbers."""
+    """Names of channels: those in `about` if all their parts differ, else colours or numbers."""
     given, known = about.get(CHANNELS, []), {1: ["Y"], 3: ["R", "G", "B"], 4: ["R", "G", "B", "A"]}
     if len(given) == channels and len(set(_of_parts(given))) == 4 * channels:
         return given

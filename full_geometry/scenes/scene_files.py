@@ -53,7 +53,7 @@ def first_cause(error: BaseException) -> str:
 
 
 class SceneError(ValueError, RuntimeError):
-    """What a plugin of this project refuses, in place of the RuntimeError by which Mitsuba hands that on."""
+    """A refusal by a plugin of this project, in place of the RuntimeError by which Mitsuba hands it on."""
 
 
 def plainly(function: Callable) -> Callable:
@@ -143,7 +143,7 @@ def open_scene(
     settings: Mapping[str, float] | None = None,
     floats: bool = False,
 ) -> Any:
-    """As `load_scene`, but nothing is prepared yet: no model is made.
+    """Load a scene as `load_scene` does, but make no model yet.
 
     With `floats`, texels of bitmaps are floats, which can be changed by any amount, whatever their files have.
     """
@@ -184,7 +184,7 @@ def _set_parameters(state: Any, plugin: str, settings: Mapping[str, float | str]
 
 
 def _settings(settings: Mapping[str, float]) -> tuple[dict, dict]:
-    """What `bssrdf` is told, and `translucent_walk`."""
+    """Settings of `bssrdf`, and of `translucent_walk`."""
     walk = {key: settings[key] for key in ("light", "layers") if key in settings}
     return {key: value for key, value in settings.items() if key != "layers"}, walk
 

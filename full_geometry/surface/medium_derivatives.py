@@ -167,7 +167,7 @@ class DifferentiableTransport(TransportAround):
     derivatives: MediumDerivatives
 
     def prepare(self, at: SurfacePoint, active: mi.Bool = True) -> tuple[Any, SurfacePoint]:
-        """As of the transport, and the exit, for transports of perturbed media."""
+        """The prepared exit of the transport, and the exit itself for transports of perturbed media."""
         return self.transport.prepare(at, active), at
 
     def S(self, exit: tuple[Any, SurfacePoint], at: SurfacePoint, active: mi.Bool = True) -> mi.Spectrum:

@@ -46,7 +46,7 @@ class MediumByWavelength:
 
     @classmethod
     def of(cls, spectra: SpectralMedium) -> MediumByWavelength:
-        """Of spectra."""
+        """Tabulate spectra at every `STEP`."""
         even = all(np.ptp(getattr(spectra, key)) == 0 for key in ("sigma_s", "sigma_a", "g"))
         ends = spectra.wavelengths[[0, -1]]
         m = spectra.medium(ends if even else _grid(*ends))

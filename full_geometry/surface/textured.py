@@ -50,7 +50,7 @@ class AlbedoTable:
 
     @classmethod
     def of(cls, g: list[float], eta: float) -> AlbedoTable:
-        """For a mean cosine of each channel and a relative index."""
+        """Tabulate a(R) for a mean cosine of each channel and a relative index."""
         most = {each: half_space_reflectance(1.0, each, eta) for each in set(g)}
         tables = {}
         for each, top in most.items():
@@ -178,7 +178,7 @@ class TexturedMedium:
 
     @property
     def textures(self) -> dict[str, mi.Texture]:
-        """By the name of their parameter."""
+        """The textures by the name of their parameter."""
         names = ("reflectance" if self.table else "albedo", "mfp" if self.inverse else "sigma_t")
         return {name: value for name, value in zip(names, (self.albedo, self.sigma_t)) if isinstance(value, mi.Texture)}
 
@@ -261,7 +261,7 @@ class TexturedMedium:
 def _interaction(
     obj: Geometry, p: mi.Point3f, n: mi.Normal3f, face: mi.UInt32 | None, active: mi.Bool
 ) -> mi.SurfaceInteraction3f:
-    """What textures ask for, at a point of an object: of a mesh from its face, else where a short ray meets it."""
+    """The interaction by which textures are looked up at a point: from the face of a mesh, else by a short ray."""
     if obj.transform is not None:
         p, n, obj = obj.transform.point_to_object(p), obj.transform.normal_to_object(n), replace(obj, transform=None)
     if face is None or not obj.shape.is_mesh():
@@ -325,7 +325,7 @@ def _is_raw(bitmap: mi.Texture) -> bool:
 
 
 def _shown_by(bitmap: mi.Texture) -> np.ndarray:
-    """What a bitmap shows at its texels, shape (rows, columns, channels); Mitsuba keeps bytes as they are in files."""
+    """The values that a bitmap shows, shape (rows, columns, channels); Mitsuba keeps bytes as they are in files."""
     data = np.array(mi.traverse(bitmap)["data"])
     if data.dtype != np.uint8:
         return data.astype(float)

@@ -356,7 +356,7 @@ def _class(variant: str) -> type:
             return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
 
         def eval_diffuse_reflectance(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
-            """What the half-space of the medium here sends towards the viewer under radiance 1 from everywhere.
+            """The directional albedo of the half-space of the medium here, towards the viewer.
 
             All orders, without what the boundary mirrors: R(mu) of `Medium.reflectance`. The `albedo` of Mitsuba's
             integrator `aov`, which leads denoisers.
@@ -528,7 +528,7 @@ COEFFICIENTS = ("sigma_s", "sigma_a", "sigma_t", "albedo", "scale", "reflectance
 
 
 def _by_wavelength(props: mi.Properties) -> tuple[str, Medium, MediumByWavelength]:
-    """Of a spectral variant: the medium at four wavelengths, and at all."""
+    """Read the medium under a spectral variant: its label, the medium at four wavelengths, and at all."""
     for key in ("material", "dilution", "channel"):
         if key in props:
             raise ValueError(

@@ -1,4 +1,4 @@
-"""What stands around a `translucent` surface: `twosided`, `normalmap`, `bumpmap`, `mask` and `blendbsdf` of Mitsuba.
+"""Wrappers of a `translucent` surface: `twosided`, `normalmap`, `bumpmap`, `mask` and `blendbsdf` of Mitsuba.
 
 - `twosided` changes nothing: an object is seen from outside.
 - `normalmap` and `bumpmap` bend the shading normal m of the boundary, at exits and entries, as interpolated normals do:
@@ -45,7 +45,7 @@ class Mix(NamedTuple):
     other: mi.BSDF
 
     def share(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
-        """Of the translucent surface."""
+        """The share of the translucent surface."""
         weight = dr.clip(self.weight.eval_1(si, active), 0, 1)
         return weight if self.second else 1 - weight
 
@@ -206,7 +206,7 @@ def wrapping_of(shape: mi.Shape) -> Wrapping | None:
 
 
 def children(node: mi.Object) -> dict[str, object]:
-    """What an object of Mitsuba holds, by name."""
+    """The objects and parameters that an object of Mitsuba holds, by name."""
     found: dict[str, object] = {}
 
     class Listing(mi.TraversalCallback):

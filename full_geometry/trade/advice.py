@@ -192,7 +192,7 @@ def _option(assessed: ObjectTrade, row: TechniqueTrade, job: Job) -> _Raw:
 
 
 def _in_time(assessed: ObjectTrade, row: TechniqueTrade, job: Job) -> _Raw:
-    """What a way comes to in the time that is allowed."""
+    """Samples and error of a technique in the time that is allowed."""
     left = (job.seconds or math.inf) - _once(row, job)
     spp = math.floor(left / (job.images * assessed.pixels * row.seconds)) if left > 0 else 0
     error = math.hypot(row.bias, math.sqrt(row.variance / spp)) if spp > 0 else math.inf
@@ -238,7 +238,7 @@ def _training(row: TechniqueTrade, job: Job) -> str:
 
 
 def _off(row: TechniqueTrade) -> str:
-    """What is known of a bias, in words."""
+    """A bias in words."""
     return "exact" if row.is_exact else f"{row.told_bias} % off"
 
 

@@ -119,7 +119,7 @@ def _way(model: str, light: str) -> Technique:
 
 
 def _samples(on: Stage, share: float) -> int:
-    """Of each exit by each way, which take that share of the samples of the first sensor's image."""
+    """Samples of each exit by each technique that take this share of the samples of the first sensor's image."""
     if not on.scene.sensors():
         return SAMPLES[0]
     camera = on.scene.sensors()[0]

@@ -56,7 +56,7 @@ class Exits:
 
 
 def visible_exits(scene: mi.Scene, shapes: list[mi.Shape], sensor: int, n: int, seed: int) -> list[Exits | None]:
-    """For each shape n rays of a sensor that meet it first, fewer where it is hardly seen, None where it is not.
+    """Find n rays of a sensor that meet each shape first; fewer where it is hardly seen, None where it is not.
 
     Args:
         scene: the Mitsuba scene.

@@ -178,7 +178,7 @@ def _row(name: str, media: list[Medium], maps: list[TracedMaps], within: list[tu
 
 
 def _seconds(model: BSSRDF) -> float:
-    """Of one value of S, NumPy."""
+    """Seconds of one value of S in NumPy."""
     rng = np.random.default_rng(0)
     r, mu = 10 ** rng.uniform(-2, 1, QUERIES), rng.uniform(0.05, 1, (2, QUERIES))
     took = []

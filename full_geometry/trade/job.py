@@ -1,4 +1,4 @@
-"""What is asked of a rendering, and how long and where the techniques for it are measured."""
+"""The job of a rendering, and the effort by which techniques for it are measured."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ TRACED_SHARE = 0.4  # of the time, for the walks that all techniques are compare
 
 @dataclass(frozen=True)
 class Job:
-    """What is to be rendered.
+    """A job of rendering.
 
     Args:
         tolerance: relative error of radiance, bias and noise together.
@@ -35,7 +35,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Effort:
-    """How a scene is measured.
+    """The effort by which a scene is measured.
 
     Args:
         seconds: for each object, shared by all techniques, compilation left out.

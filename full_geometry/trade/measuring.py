@@ -50,7 +50,7 @@ Samples = dict[Technique, "list[Sampled] | str"]  # of an object by each techniq
 
 
 class RunBudget(NamedTuple):
-    """What a run of several techniques may take.
+    """The time or samples that a run of several techniques may take.
 
     Args:
         seconds: for each object; with 0 the first samples are all.
@@ -262,12 +262,12 @@ def _begun(
 
 
 def _of_cost(on: Stage, technique: Technique, sampled: list[Sampled]) -> list[Sampled]:
-    """Of the runs of a technique, those in the light of the scene, which tell its cost."""
+    """The runs of a technique in the light of the scene, which tell its cost."""
     return [each for run, each in zip(on.runs(technique), sampled) if not run.smoothed]
 
 
 def _of_bias(on: Stage, technique: Technique, sampled: list[Sampled]) -> list[Sampled]:
-    """Of the runs of a technique, those that tell its bias: by the smoothed environment if there is one."""
+    """The runs of a technique that tell its bias: those by the smoothed environment if there is one."""
     return [each for run, each in zip(on.runs(technique), sampled) if run.smoothed == (on.smoothed is not None)]
 
 
@@ -299,7 +299,7 @@ def _row(on: Stage, k: int, technique: Technique, sampled: list[Sampled] | str, 
 
 
 def _kept(on: Stage, k: int, technique: Technique) -> float:
-    """Of the variance of parts of gathered light, the share that a render has."""
+    """The share of the variance of parts of gathered light that a render has."""
     one, two = (on.integrator(half).gathering for half in technique.halves)
     return one.kept(two, k)
 

@@ -1,4 +1,4 @@
-"""What an assessment finds: numbers of each way on each object, as dataclasses, a table and JSON."""
+"""The results of an assessment: numbers of each technique on each object, as dataclasses, a table and JSON."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class TechniqueTrade:
 
     @property
     def bias_bound(self) -> float:
-        """What the bias is below in 95 % of cases; a square that came out below 0 counts as 0."""
+        """A bound that the bias is below in 95 % of cases; a square that came out below 0 counts as 0."""
         return self.off.bound
 
     def time_to(self, noise: float) -> float:
@@ -185,7 +185,7 @@ class Assessment:
 
     @classmethod
     def of(cls, record: dict[str, Any]) -> Assessment:
-        """From a record."""
+        """Read an assessment from a `record`."""
         objects = []
         for o in record["objects"]:
             rows = tuple(TechniqueTrade(**{key: _known(key, value) for key, value in w.items()}) for w in o["ways"])

@@ -29,7 +29,7 @@ BLUR = 8.0  # 0.4 radians
 
 @dataclass(eq=False)
 class Sampled:
-    """What has been sampled of an object by a way.
+    """The samples of an object by a technique, with what they cost.
 
     Attributes:
         estimate: radiance of the exits.
@@ -56,7 +56,7 @@ class Sampled:
 
     @property
     def seconds(self) -> float:
-        """Of one sample, the least of all launches, without what one takes whatever its size, as images are larger."""
+        """Seconds of one sample, the least of all launches, without the overhead of a launch, as images are larger."""
         return min(max(took - self.overhead, LEAST_SHARE * took) / n for n, took in self.launches)
 
 
@@ -219,7 +219,7 @@ def _sampler(seed: int, rays: mi.Ray3f) -> mi.Sampler:
 
 
 def _sums(L: list[mi.Float], each: int) -> tuple[np.ndarray, np.ndarray]:
-    """Of values and of squares over the samples of each exit, (channels, n)."""
+    """Sums of values and of squares over the samples of each exit, (channels, n)."""
 
     sums = [dr.block_sum(v, each) for c in L for v in (c, c * c)]
     dr.eval(sums)

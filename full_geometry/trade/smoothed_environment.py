@@ -77,17 +77,17 @@ def smoothed(pixels: np.ndarray) -> np.ndarray:
 
 
 def _weights(fine: np.ndarray, coarse: np.ndarray, period: float | None = None) -> np.ndarray:
-    """Of coarse angles, by which their values are interpolated at fine ones."""
+    """The matrix that interpolates values at coarse angles to fine ones."""
     return np.stack([np.interp(fine, coarse, row, period=period) for row in np.eye(len(coarse))], axis=1)
 
 
 def _angles(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
-    """Of the pixels of a map, from pole to pole."""
+    """Polar angles and azimuths of the pixels of a map, from pole to pole."""
     return np.linspace(0, np.pi, rows), (np.arange(columns) + 0.5) * 2 * np.pi / columns
 
 
 def _directions(theta: np.ndarray, phi: np.ndarray) -> np.ndarray:
-    """Of pixels at these angles, (rows columns, 3); axes do not matter to angles between them."""
+    """Directions of pixels at these angles, (rows columns, 3), about any axis."""
     theta, phi = theta[:, None], phi[None]
     x, y, z = np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi
     return np.stack([x, y, z], axis=-1).reshape(-1, 3)

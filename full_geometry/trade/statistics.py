@@ -50,14 +50,14 @@ class RadianceEstimate:
         self.samples += samples
 
     def add_bright(self, values: np.ndarray, each: int) -> None:
-        """Of a launch, (channels, n each) with the samples of an exit next to each other, what may be fireflies."""
+        """Keep the brightest samples of a launch, (channels, n each) with those of an exit next to each other."""
         keep = min(int(4 * FIREFLIES * values.shape[1]) + 8, values.shape[1])
         for c, row in enumerate(values):
             index = np.argpartition(row, -keep)[-keep:]
             self.bright[c] = tuple(np.concatenate(p) for p in zip(self.bright[c], (row[index], index // each)))
 
     def of_first(self, n: int) -> RadianceEstimate:
-        """Of the first n exits."""
+        """The estimate of the first n exits."""
         result = RadianceEstimate(len(self.first), n)
         result.add(self.first[:, :n], self.second[:, :n], self.samples)
         result.bright = [(values[exits < n], exits[exits < n]) for values, exits in self.bright]
@@ -69,13 +69,13 @@ class RadianceEstimate:
 
     @property
     def sample_variance(self) -> np.ndarray:
-        """Of one sample."""
+        """The variance of one sample."""
         n = self.samples
         return np.maximum(self.second / n - self.mean**2, 0) * (n / (n - 1))
 
     @property
     def steady_variance(self) -> np.ndarray:
-        """Of one sample, without fireflies."""
+        """The variance of one sample without fireflies."""
         channels, n = self.first.shape
         first, second, samples = self.first.copy(), self.second.copy(), np.full((channels, n), float(self.samples))
         for c in range(channels):
@@ -87,7 +87,7 @@ class RadianceEstimate:
 
     @property
     def variance(self) -> np.ndarray:
-        """Of the mean."""
+        """The variance of the mean."""
         return self.sample_variance / self.samples
 
     def _fireflies(self, channel: int) -> tuple[np.ndarray, np.ndarray, float]:
@@ -122,7 +122,7 @@ class RadianceEstimate:
 
 
 class SteadyMean(NamedTuple):
-    """Of exits, (channels, n), with the noise of each alone, and what all share, relative, (channels,)."""
+    """Means of exits, (channels, n), with the noise of each alone, and the relative noise of all, (channels,)."""
 
     mean: np.ndarray
     variance: np.ndarray

@@ -53,12 +53,12 @@ class Technique:
 
     @property
     def halves(self) -> tuple[Technique, ...]:
-        """What it is measured by: itself, or two independent parts of gathered light."""
+        """The techniques that it is measured by: itself, or two independent parts of gathered light."""
         return (replace(self, part=1), replace(self, part=2)) if self.light == GATHERED else (self,)
 
     @property
     def name(self) -> str:
-        """As tables show it."""
+        """The name in tables."""
         parts = (self.model, NO_SINGLE if self.orders else "", GATHERED if self.light == GATHERED else "")
         return ", ".join(filter(None, parts))
 
@@ -139,7 +139,7 @@ class Stage:
                 smoothed.show(False)
 
     def runs(self, technique: Technique) -> tuple[Technique, ...]:
-        """What a technique is measured by: its halves; smoothed for the bias, with one half unsmoothed for the cost."""
+        """The runs of a technique: its halves; smoothed for the bias, with one half unsmoothed for the cost."""
         if self.smoothed is None:
             return technique.halves
         *rest, last = (replace(half, smoothed=True) for half in technique.halves)
@@ -201,7 +201,7 @@ def stage(scene: mi.Scene | dict[str, Any] | str | Path, parameters: dict[str, s
 
 
 def _settings(scene: mi.Scene) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What both integrators are told, and `bssrdf` alone; what the scene says, where its integrator is one of them."""
+    """Settings of both integrators, and of `bssrdf` alone, from the integrator of the scene where it is one of them."""
     integrator = scene.integrator()
     if is_bssrdf(integrator):
         return integrator.settings.shared(), integrator.settings.of_models()
