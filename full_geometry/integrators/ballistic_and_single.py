@@ -8,7 +8,9 @@ reflected at the boundary by Fresnel as often as it takes, and leaves. After k =
 p the density of the walk; the factors eta² of radiance cancel, and Fresnel's inside with the probability of reflection.
 Whether a segment is passed, and where and how the walk is scattered, is drawn for the channels by their weights f_c so
 far. Of events some are drawn nearer the boundary, and of directions some towards it: that light is little attenuated.
-This is no `walk.random_walk`, which draws free flights: most of those are scattered again and would count nothing.
+This is no `walk.random_walk`, whose free flights mostly end in events that are scattered again and count nothing: with
+at most one event that has 1.8 to 11 times the variance x time of this on five of six test scenes, and 0.3 on a dark
+bunny under a large lamp.
 
 Light of emitters and suns that reaches the event after one reflection or none is found by emitter connections: rays
 that are refracted towards a sampled point of them, see `specular_connections`. Connections with an uneven environment,
@@ -283,6 +285,7 @@ def light_at_events(
     start = replace(start, inverse_pdf=4 * dr.pi * scale, order=mi.UInt32(1))
     start.event.inverse_pdf = mi.Float(1)
 
+    # ---- to the boundary and out, reflected as often as it takes; Λ adds up
     def step(k: mi.UInt32, sampler: mi.Sampler, walk: OneEventWalk) -> tuple:
         met, length = _to_boundary(obj, walk)
         walk = _meet_boundary(obj, m, replace(walk, length=walk.length + length), met, sampler)
@@ -477,6 +480,7 @@ def _contribution(m: Coefficients, length: mi.Float, order: mi.UInt32, cosine: m
 
 def _pick(values: mi.Spectrum, weights: mi.Spectrum, u: mi.Float) -> mi.Float:
     """The value of a channel drawn by its weight, for a uniform number."""
+    # the channel k in which Σ_{j <= k} w_j passes u Σ w
     u, value = u * dr.sum(weights), values[0]
     for k in range(1, len(values)):
         u = u - weights[k - 1]
@@ -585,6 +589,7 @@ def _way(context: RenderContext, at: LitEvent, target: _Target, met: Connection)
 
 def _phase_pdf(obj: TranslucentObject, walk: OneEventWalk, met: Connection) -> mi.Float:
     """Density by which phase sampling draws the direction of a connection, 1/sr inside, see `_scatter`."""
+    # by the weights W_c of the channels at the event, as the walk has drawn its direction
     m = _coefficients(obj, walk.medium)
     W = _contribution(m, walk.event.length, mi.UInt32(1), None)
     return _direction_pdf(obj, m, W, dr.dot(walk.event.d, met.d), dr.dot(walk.event.n, met.d))
@@ -596,6 +601,7 @@ def _environment_pdf(obj: TranslucentObject, walk: OneEventWalk, active: mi.Bool
     Elsewhere 1 and 0.
     """
     with dr.suspend_grad():
+        # p_f per solid angle outside: p(d) T dw_inside / dw_outside of the connection along the way of the walk
         reach = opaque(FAR * obj.geometry.size)
         met = refracted_connection(obj, walk.event.p, walk.event.p + walk.d * reach, active)
         same = active & _leaves(obj, met, walk.o, SAME_WAY)
@@ -626,6 +632,7 @@ def _spread_lights(
     context: RenderContext, obj: TranslucentObject, walk: OneEventWalk, sampler: mi.Sampler, active: mi.Bool
 ) -> mi.Spectrum:
     """Light of a delta light whose cone holds a walk's way out, which no connection with it would find."""
+    # E / Ω of one of the lights, but where a connection of the event with it takes the way of the walk
     ray = ray_from(place(walk.o, walk.n, walk.medium), walk.d, obj.geometry.clearance)
     which, L = delta_light(context, sampler, ray, active)
     with dr.suspend_grad():
@@ -704,6 +711,7 @@ def _ways(
         kind, n = dr.select(ends, kind + 1, kind), dr.select(ends, 0, n + 1)
         return kind, n, sampler, counted, (straight, p), way, ways
 
+    # kinds 0, 1, 2: the first guess, random directions, random directions with a reflection
     def none() -> _Way:
         return _Way(mi.Vector3f(0, 0, 1), mi.Float(0), mi.Float(0))
 
@@ -717,6 +725,7 @@ def _taken(
     active: mi.Bool,
 ) -> Connection:  # fmt: skip
     """The connection by which a walk has left its event, if one is found; without, phase sampling alone finds it."""
+    # ---- trials 0 ... N, until one leaves the object where the walk has left it
     near, reflected = _near(obj, walk, target, active), walk.reflections == 1
 
     def step(n: mi.UInt32, sampler: mi.Sampler, found: Connection, active: mi.Bool) -> tuple:
@@ -734,6 +743,7 @@ def _near(obj: TranslucentObject, walk: OneEventWalk, target: mi.Point3f, active
     """Whether other connections are looked for: where light of the target is likely to be seen."""
     if obj.geometry.inclusions is not None:
         return mi.Bool(False)
+    # whether the boundary is met within `NEAR` mean free paths on the straight way
     ray = mi.Ray3f(walk.event.p, dr.normalize(target - walk.event.p))
     ray.maxt = NEAR / (dr.min(walk.medium.sigma_t) if walk.medium else opaque(min(m.sigma_t for m in obj.media)))
     return obj.geometry.ray_test(ray, False, active)

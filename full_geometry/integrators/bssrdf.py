@@ -112,12 +112,15 @@ def _class(variant: str) -> type:
             """The image, in launches, between which an interrupt is heard."""
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             with interruptible(), undisturbed(), dr.suspend_grad():
+                # ---- the objects, and proposals for their entries by the light
                 objects = self.prepare(scene)
                 for obj in objects:
                     if obj.spectral is not None:
                         obj.spectral.check_covers(obj.geometry.name, sensor)
                 self._lit = self._by_light(scene, objects, sensor, spp)
                 self._unconnected = dr.zeros(mi.Float64, 1)
+
+                # ---- launches, each added to the film
                 try:
                     sensor.film().prepare([])
                     for launch in launches(sensor, spp):
@@ -129,6 +132,7 @@ def _class(variant: str) -> type:
 
         def _launch(self, scene: mi.Scene, sensor: mi.Sensor, seed: int, launch: Launch) -> None:
             """Add the samples of a launch to the film."""
+            # camera rays, L of each, and its weight by the reconstruction filter
             sampler = launch.sampler(sensor, seed)
             ray, weight, position = rays_by(sensor, sampler)
             L, hit, _ = self.sample(scene, sampler, ray)
@@ -140,6 +144,7 @@ def _class(variant: str) -> type:
             """The objects with entries drawn by light, where that pays."""
             if self._objects.choices.light == "gathered":
                 return objects
+            # the more samples an image has, the more are spent on where light arrives
             spp, pixels = spp or sensor.sampler().sample_count(), int(dr.prod(sensor.film().crop_size()))
             proposals = self._lit_entries.of(scene, objects, self.settings, spp * pixels)
             return [replace(obj, proposals=given) for obj, given in zip(objects, proposals)]
@@ -170,6 +175,7 @@ def _class(variant: str) -> type:
                 objects = self._prepared(scene) if self._lit is None else self._lit
                 ray = shown(scene, objects, self.settings, ray)
                 parts, hit, unconnected = trace_paths(scene, objects, self.settings, sampler, ray, active)
+                # the sum of squares tells how much of the variance phase sampling alone brings
                 squares = dr.select(hit & active, mi.Float64(dr.squared_norm(unconnected)), 0)
                 dr.scatter_add(self._unconnected, squares, mi.UInt32(0))
             return parts[0] + parts[1], hit | mi.Bool(shows_sky(scene, self.settings.hide_emitters)), []
@@ -245,6 +251,7 @@ def launches(sensor: mi.Sensor, spp: int) -> Iterator[Launch]:
     samplers round the samples of each launch up to a square or another number of strata: they have one launch.
     """
     spp = spp or sensor.sampler().sample_count()
+    # n launches of about `SAMPLES_PER_LAUNCH`, the first and last sample of each
     n = min(math.ceil(spp * int(dr.prod(sensor.film().crop_size())) / SAMPLES_PER_LAUNCH), spp)
     ends = [(spp * k) // n for k in range(n + 1)] if is_independent(sensor.sampler()) else [0, spp]
     for first, last in zip(ends, ends[1:]):
@@ -267,6 +274,7 @@ def check_parameters(scene: mi.Scene) -> None:
             if not dr.grad_enabled(parameters[key]):
                 continue
         name = key.rsplit(".", 1)[-1]
+        # what moves paths is held in a replay, so that derivatives by it would be wrong
         fixed = bool(flags & int(mi.ParamFlags.NonDifferentiable))
         if fixed or name in GEOMETRY or _moves(owner, name) or _selects(parameters, owner, name):
             raise ValueError(
@@ -297,6 +305,7 @@ def _moves(owner: mi.Object, name: str) -> bool:
 
 def _selects(parameters: mi.SceneParameters, owner: mi.Object | None, name: str) -> bool:
     """Whether a parameter does more than scale light: the share of a mirror in a blend, the index that a medium has."""
+    # up the tree of BSDFs: the weight of a blend with a delta lobe chooses, the index of a translucent surface bends
     own = True
     while owner is not None:
         if isinstance(owner, mi.BSDF):
@@ -327,6 +336,7 @@ def replayer(objects: list[TranslucentObject], settings: Settings) -> mi.Integra
 
         def sample(self, mode: dr.ADMode, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, **given: Any) -> tuple:
             ray = shown(scene, objects, settings, ray)
+            # the first pass keeps L; the replay takes the light of each vertex from it, see `lighting.Replay`
             if mode == dr.ADMode.Primal:
                 parts, hit, _ = trace_paths(scene, objects, settings, sampler, ray, given["active"])
                 return parts[0] + parts[1], hit | mi.Bool(shows_sky(scene, settings.hide_emitters)), [], parts

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -106,6 +106,7 @@ class Gathered:
     @cached_property
     def error(self) -> float:
         """Standard error of B by the gathering of light, over its mean; NaN where that is not in parts."""
+        # sqrt(mean variance of the parts / their number) over the mean of B
         found = np.stack([self.matrix.mean(part) + self.c for part in self.parts])
         spread = found.var(axis=0, ddof=1).mean() if len(found) > 1 else np.nan
         return float(np.sqrt(spread / len(found)) / max(float(found.mean()), 1e-30))
@@ -200,6 +201,7 @@ def spreads(obj: TranslucentObject) -> bool:
 
 
 def _check(obj: TranslucentObject) -> None:
+    # points have one side, and their number comes from the area; maps bend normals between them
     result = obj.geometry
     if not result.closed or not result.area > 0:
         lacks = "is not closed" if not result.closed else f"is a {result.shape.class_name()} without known area"
@@ -220,6 +222,7 @@ def _lit(
     settings: Settings, seed: int, parts: int,
 ) -> list[TranslucentObject]:  # fmt: skip
     """The objects, those with a transport matrix by what leaves them; what they send each other is sampled."""
+    # the light of one object does not wait for what is gathered of the others
     found = list(objects)
     for k, (obj, (T, events)) in enumerate(zip(objects, ways)):
         if T is not None:
@@ -258,6 +261,8 @@ def _leaving(
     if obj.textured is None:
         direct = np.maximum(rays.light.sum(axis=1) / T.around.whole - c, 0)
         B += T.beyond(direct.astype(np.float32), rays)
+
+    # ---- four numbers for each channel of a point, as data of a kernel
     values = mi.Float(B.astype(np.float32).ravel())
     return Gathered(
         object=obj,
@@ -323,7 +328,8 @@ def _incident(
     found = np.stack([np.array(v, dtype=float) for v in sums], axis=1).reshape(rows, len(values), -1) / n
     at = np.array(order)
 
-    def by_point(v: Any) -> np.ndarray:
+    # ---- rays of each point: directions of emitters, then of the cosine, of all parts
+    def by_point(v: mi.Vector3f | mi.Spectrum) -> np.ndarray:
         v = np.array(v).T[at].reshape(parts, count, n, -1)
         return np.moveaxis(v, 0, 1).reshape(count, parts * n, -1)
 
@@ -358,6 +364,7 @@ def _steadied(sent: np.ndarray) -> np.ndarray:
 
     Of mirrored lamps a few points may hold half of all light; what is cut goes to all points by what they have.
     """
+    # min(sent, quantile), scaled to the same sum
     most = np.quantile(sent, 1 - BRIGHTEST, axis=0)
     kept = np.where(most > 0, np.minimum(sent, most), sent)
     whole = sent.sum(axis=0) / np.maximum(kept.sum(axis=0), 1e-30)
@@ -386,6 +393,7 @@ def _numbers(*values: int) -> list[mi.UInt32]:
 
 def _stratified(sampler: mi.Sampler, j: mi.UInt32, s: mi.UInt32, n: mi.UInt32) -> mi.Point2f:
     """Pairs of uniforms for n directions of each point, a lattice shifted for each point."""
+    # direction s of n: (s / n, s golden), shifted by two random numbers of the point, modulo 1
     shift = dr.gather(mi.Point2f, sampler.next_2d(), j * n)
     x = mi.Point2f(mi.Float(s) / mi.Float(n) + shift.x, dr.fma(mi.Float(s), GOLDEN, shift.y))
     return x - dr.floor(x)

@@ -8,7 +8,7 @@ boundary: so its bright parts are found without a search.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -16,7 +16,7 @@ import numpy as np
 
 from full_geometry.geometry.points import opaque, place, wrapped
 from full_geometry.geometry.rounding import ray_from
-from full_geometry.integrators.ballistic_and_single import light_at_events
+from full_geometry.integrators.ballistic_and_single import OneEventWalk, light_at_events
 from full_geometry.integrators.lighting import Primal, RenderContext
 from full_geometry.precomputed.inner import Events, InnerLight, bands
 from full_geometry.precomputed.transport_matrix import R_2
@@ -69,6 +69,8 @@ def inner_light(
         for total, Y in zip(values, dr.sh_eval(w, largest)):
             total[0] = total[0] + light * Y
     lanes = dr.zeros(mi.Float, n * count)
+
+    # ---- the mean over the directions of an event
     channels = [total[0][c] + lanes for total in values for c in range(dr.size_v(mi.Spectrum))]
     dr.eval(channels)
     channels = [dr.block_sum(v, n) / n for v in channels] if n > 1 else channels
@@ -118,7 +120,7 @@ def _raised(w: mi.Vector3f, z: mi.Float) -> mi.Vector3f:
 
 
 def _beyond(
-    context: RenderContext, obj: TranslucentObject, left: Any, others: tuple[SurfacePoints, mi.Float]
+    context: RenderContext, obj: TranslucentObject, left: OneEventWalk, others: tuple[SurfacePoints, mi.Float]
 ) -> mi.Spectrum:
     """Radiance that walks meet outside, but for that of emitters which connections may have found."""
     # emission, but for what connections find after at most one reflection

@@ -80,6 +80,7 @@ class Replay:
 
     def add(self, radiance: PathRadiance, light: mi.Spectrum) -> PathRadiance:
         """Take the light of one estimator away, and differentiate it."""
+        # d light, all that light is made of held but for one factor; then L without it
         radiance = self._differentiate(radiance, light)
         return replace(radiance, L=radiance.L - dr.detach(light))
 
@@ -145,6 +146,7 @@ class Lights:
     @classmethod
     def of(cls, scene: mi.Scene) -> Lights:
         """The kinds of emitters of a scene."""
+        # next-event estimation adds noise alone where all light is an even environment
         emitters = scene.emitters()
         even = all("Constant" in emitter.class_name() for emitter in emitters)
         delta = any(map(is_delta, emitters))
@@ -263,6 +265,7 @@ class RenderContext:
 
     def entries(self, obj: TranslucentObject) -> int:
         """Candidates of resampling for an exit: one where c is nearly all light and the settings leave it open."""
+        # what resampling would choose by is nearly even where c is taken off
         alone = self.uses_environment_mean(obj) and not self.lights.some_local
         return 1 if alone and self.settings.entries == AUTOMATIC else obj.entries
 
@@ -275,6 +278,7 @@ class RenderContext:
         self, at: mi.Interaction3f, u: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.Vector3f, mi.Float, mi.Spectrum]:
         """A direction of the environment, the only emitter, its density, 1/sr, and the radiance from there."""
+        # L, from L / p_e
         ds, light = self.scene.sample_emitter_direction(at, u, False, active)
         return ds.d, ds.pdf, light * ds.pdf
 
@@ -304,6 +308,7 @@ def delta_light(
     context: RenderContext, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool
 ) -> tuple[mi.UInt32, mi.Spectrum]:
     """One of the delta lights, and its light along a ray, spread over a wide cone, over its probability."""
+    # n E / Ω of one of n lights
     n = context.small.n_delta
     which = below(n, sampler.next_1d()) if n > 1 else mi.UInt32(0)
     return which, n * context.small.spread(which, ray, mi.Float(WIDE), active)

@@ -94,6 +94,7 @@ def _lit(context: RenderContext, obj: TranslucentObject, count: int) -> Proposal
 
 def _cells(geometry: Geometry, faces: int) -> np.ndarray:
     """The cell of each face: that of the point which is nearest to its centroid, or its own where faces are few."""
+    # a mesh of few faces has enough samples for each of them
     points = SurfacePoints.of(geometry, CELLS)
     if faces < FACES * len(points):
         return np.arange(faces)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -105,6 +105,7 @@ def trace_paths(
     The second part is light of orders 0 and 1 of the object that the ray meets first. What phase sampling alone has hit
     is in both. `scattered` says whether the ray is one of many that a vertex may have sent, as for a path that goes on.
     """
+    # the first pass adds up; L of both its parts begins at 0
     context = RenderContext.of(scene, objects, settings, Primal())
     L, radiance, hit = _loop(context, sampler, ray, (mi.Spectrum(0), mi.Spectrum(0)), (), active, scattered)
     return L, hit, radiance.unconnected
@@ -123,6 +124,7 @@ def replay_paths(
         d: backward: adjoint of the radiance, which is handed on to the parameters of the scene.
         backward: otherwise the derivative of the radiance is returned, for the derivatives that the parameters carry.
     """
+    # the second pass begins with L and takes from it what each vertex had added
     context = RenderContext.of(scene, objects, settings, Replay(backward))
     return _loop(context, sampler, ray, L, mi.Spectrum(0 if d is None else d), mi.Bool(True))[1].derivative
 
@@ -151,12 +153,12 @@ def _loop(
         # ---- emission: L += throughput L_e p_f / (p_f + p_e), against next-event estimation at the last vertex
         with dr.resume_grad(when=mode.tracks):
             shown = ~first if settings.hide_emitters else mi.Bool(True)
-            counts = active & ~(first & path.second_pass)
-            L_e = weighted_emission(context, sampler, path.ray, si, path.previous, shown, path.scattered, counts)
+            counts, previous = active & ~(first & path.second_pass), path.previous
+            L_e = weighted_emission(context, sampler, path.ray, si, previous, shown, path.scattered, active=counts)
             radiance = mode.add(path.radiance, path.throughput * L_e)
-            radiance = mode.add_unconnected(radiance, dr.select(path.previous.unconnected, path.throughput * L_e, 0))
+            radiance = mode.add_unconnected(radiance, dr.select(previous.unconnected, path.throughput * L_e, 0))
         hit = path.hit | (first & si.is_valid())
-        active = active & si.is_valid() & (path.previous.emitter_distance < 0) & (path.depth + 1 < max_depth)
+        active = active & si.is_valid() & (previous.emitter_distance < 0) & (path.depth + 1 < max_depth)
         needs_second = path.needs_second | (active & first & _on_splitting(context, si))
 
         # ---- event: L += throughput f L_e / p_e w_e, its next-event estimation; throughput *= f cos / p_f, its ray
@@ -193,6 +195,8 @@ def _loop(
     start = _path_start(camera_ray, PathRadiance(L[0], derivative, mi.Spectrum(0)), scattered, active)
     with dr.suspend_grad():
         _, path = dr.while_loop((sampler, start), lambda sampler, path: path.active, step, label="bssrdf")
+
+    # ---- L of the first pass, and of the second where there was one
     two = path.second_pass
     parts = dr.select(two, path.L_first, path.radiance.L), dr.select(two, path.radiance.L, 0)
     return parts, path.radiance, path.hit
@@ -231,6 +235,7 @@ def _path_end() -> NextVertex:
 
 def _on_splitting(context: RenderContext, si: mi.SurfaceInteraction3f) -> mi.Bool:
     """Whether a point is on an object with orders 0 and 1 and others."""
+    # objects of which the first pass and the second have orders each
     on_one = mi.Bool(False)
     for obj in context.objects:
         if obj.splits:
@@ -302,11 +307,13 @@ def met_surface(
     context: RenderContext, sampler: mi.Sampler, ray: mi.Ray3f, si: mi.SurfaceInteraction3f, active: mi.Bool
 ) -> tuple[mi.SurfaceInteraction3f, mi.BSDFPtr]:
     """What a ray meets: the interaction as normal maps bend it, and the BSDF that masks and blends leave."""
+    # of each object with a mask, a blend or a map around its surface
     bsdf = si.bsdf(ray)
     for obj in context.objects:
         around = obj.wrapping
         if around.surface is obj.geometry.shape.bsdf():
             continue
+        # one of the surfaces by its opacity, then the normal of the map where the translucent one is met
         with dr.suspend_grad():
             here = active & (si.shape == mi.ShapePtr(obj.geometry.shape))
             own = mi.BSDFPtr(around.surface)
@@ -409,6 +416,7 @@ def choose_event(obj: TranslucentObject, si: mi.SurfaceInteraction3f, active: mi
 
 def _transmittance(obj: TranslucentObject, out: SurfacePoint, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
     """Transmittance to the other side, mean over channels; not by the light so far, as choices hold in derivatives."""
+    # Σ_c exp(-sigma_t,c t) / n to the boundary opposite
     ray = ray_from(place(out.p, out.n), d, obj.geometry.clearance)
     wall = obj.geometry.ray_intersect(ray, mi.RayFlags.Minimal, False, active)
     T, each = mi.Float(0), out.medium.sigma_t if out.medium else [opaque(m.sigma_t) for m in obj.media]
@@ -431,6 +439,7 @@ def _where(context: RenderContext, sampler: mi.Sampler, mask: mi.Bool, otherwise
     An event that no neighbouring lane asks for is not computed. Derivatives do not leave the event.
     """
 
+    # a branch of the kernel; derivatives are followed inside and end there
     def happens(sampler: mi.Sampler, otherwise: tuple) -> tuple:
         with dr.resume_grad(when=context.mode.tracks):
             return sampler, dr.detach(tuple(event(*otherwise)))
@@ -456,6 +465,7 @@ def _add_environment_means(
             here: mi.Bool = here,
             out: SurfacePoint = choice.refracted.out,
         ) -> tuple[PathRadiance]:
+            # (alpha_1 of orders 0 and 1 + alpha of the others) c, each in the pass that has those orders
             once, others = obj.alpha(out, here)
             once = dr.select(at.others_only, 0, once) if obj.low_orders else mi.Spectrum(0)
             light = (once + dr.select(at.one_event_only, 0, others)) * context.environment_mean.mean
@@ -548,10 +558,13 @@ def _add_mirrored(
     """
 
     def look(_: mi.Spectrum, __: mi.Bool, radiance: PathRadiance) -> tuple[mi.Spectrum, mi.Bool, PathRadiance]:
+        # L += throughput F L_e along the mirrored ray
         origin = reflected.previous
         ray = _ray_from(origin, reflected.d, at.ray)
         si = context.ray_intersect(ray, False, active)
-        L_e = weighted_emission(context, sampler, ray, si, origin, mi.Bool(True), at.scattered, active)
+        L_e = weighted_emission(
+            context, sampler, ray, si, origin, shown=mi.Bool(True), scattered=at.scattered, active=active
+        )
         light = at.throughput * L_e
         return light, active & si.is_valid(), context.mode.add(radiance, reflected.weight * light)
 
@@ -590,6 +603,7 @@ def _differentiable(
 
     A delta lobe has no value to ask for: its weight times the probability of the lobe has the derivative.
     """
+    # delta lobes: weight P(lobe) / detached P(lobe); others: f(w) cos / p(w), w and p held
     pdf = dr.detach(bs.pdf)
     inverse = dr.select(pdf > 0, dr.rcp(pdf), 0)
     lobe = weight * (bs.pdf * inverse)
@@ -614,6 +628,7 @@ def one_event(
     c of `lighting.EnvironmentMean` is taken off the former where `_add_environment_means` has added alpha c. Last comes
     what of the light phase sampling alone has hit.
     """
+    # the way out of the walk is the next vertex; light of connections is added at this one
     sample = sample_one_event(context, obj, refracted, sampler, scattered, active)
     previous = PreviousVertex(
         p=sample.p, n=sample.n, e=mi.Float(obj.geometry.clearance), pdf=sample.pdf, emitter_share=sample.emitter_share,
@@ -642,6 +657,7 @@ def bssrdf_event(
     Delta lights are its next-event estimation. c of `lighting.EnvironmentMean` is taken off where
     `_add_environment_means` has added alpha c.
     """
+    # ---- an entry x_i and a direction w_i, of weight S mu_i / p
     entry = resample_entry(context, obj, out, face, sampler, active)
     # ---- control variate: -S mu_i c / p, of the share that directions of the environment have
     direct = mi.Spectrum(0)
@@ -695,8 +711,8 @@ class _ExitPoint(NamedTuple):
 
     out: SurfacePoint
     face: mi.UInt32
-    transport: Any
-    proposals: Any
+    transport: object
+    proposals: object
 
 
 def resample_entry(
@@ -713,6 +729,7 @@ def resample_entry(
     resampling target: the largest channel of W_k times the light of a sampled emitter. Its weight is W_k Σ w / (N w_k),
     the mean of all candidates. The ray that goes on tests the visibility of the one kept.
     """
+    # ---- what transport and proposals make of the exit once, for all candidates
     with dr.suspend_grad():
         prepared = obj.transport.prepare(out, active)
         exit_point = _ExitPoint(out, face, prepared, obj.proposals.prepare(out, prepared, active))

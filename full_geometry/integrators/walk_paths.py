@@ -154,6 +154,7 @@ class LightVisitor:
         return walk, replace(record, departure=departure)
 
     def _connect(self, walk: Walk, record: LightRecord, event: Event) -> tuple[Walk, LightRecord, Event]:
+        # L += throughput Σ connections of a light subpath with this event
         light, slopes, rng = self.connections.light(event, walk.rng)
         return replace(walk, rng=rng), _plus(record, walk, light, slopes), event
 
@@ -311,6 +312,7 @@ class LightVisitor:
         """Light of an inner light whose cone holds the ray, from a vertex that it was not sampled at."""
         if self.inner_lights is None:
             return mi.Spectrum(0)
+        # L += throughput n E / Ω T
         ray = ray_of(walk.o + walk.off, walk.d, walk.medium)
         active = active & walk.alive & (walk.object >= 0)
         L = self.inner_lights.spread(walk.object, ray, walk.rng, active, walk.medium)
@@ -329,12 +331,13 @@ class LightVisitor:
         return walk.weight * next_event(self.scene, self.media.instance_scene, (si, bsdf), u, active, outwards)
 
 
-def _same_state(*state: Any) -> tuple:
+def _same_state(*state: object) -> tuple:
     return state
 
 
 def _plus(record: LightRecord, walk: Walk, light: mi.Spectrum, slopes: Score | tuple[()]) -> LightRecord:
     """With light per weight of the walk, and its slopes beyond those of the walk."""
+    # slopes of the contribution, as its score beyond that of the walk times it
     slopes = slopes and record.slopes + slopes * walk.weight
     return replace(record, L=record.L + walk.weight * light, slopes=slopes)
 
@@ -405,6 +408,7 @@ class PathTracer:
             path = _begin(rays, total, index, rng, media, bool(scores), self.visitor.forward)
             return replace(path, emission=dr.zeros(mi.Spectrum, dr.width(index))) if self.layers else path
 
+        # inside: a free flight, with what is recorded beside the light
         def inside(p: CameraPath) -> CameraPath:
             record = FirstExitRecord(p.light, p.index, p.depth == 1) if exits else p.light
             record = StayRecord(p.light, p.index, p.stay) if scores else record
@@ -416,6 +420,7 @@ class PathTracer:
             record = scorer.end(StayRecord(p.light, p.index, p.stay))
             return replace(p, light=record.record, stay=record.stay)
 
+        # a path that has ended: its light is stored, and the lane takes another ray
         def renew(p: CameraPath) -> CameraPath:
             dr.scatter(L, p.light.L, p.index)
             dr.scatter(hit, p.hit, p.index)
@@ -542,6 +547,7 @@ class PathTracer:
         media = self.visitor.media
         if self.visitor.unscattered is None:
             return mi.Bool(False), L, p
+        # F L_e is added whatever is chosen, so that the reflected ray must not count emission again
         mirrors = active & ~media.row("rough", k)
         L_e = self.visitor.mirrored_emitter(p.walk, si, bsdf, mirrors)
         if self.layers:
@@ -629,7 +635,7 @@ class FirstExits:
 class FirstExitRecord:
     """What a visitor keeps of a path, the number of the path, and whether it is inside the object it met first."""
 
-    record: Any
+    record: LightRecord
     index: mi.UInt32
     first: mi.Bool
 

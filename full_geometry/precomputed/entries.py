@@ -118,6 +118,8 @@ def _places(
 ) -> tuple[EntrySample, mi.UInt32]:
     """Uniform places in the order of their points, of that rank, and those."""
     u = [mi.Float(np.minimum(v, 1 - 2**-24).astype(np.float32)) for v in lattice(PLACES, ROOTS, rng.random(3))]
+
+    # uniform places, and the point that each belongs to
     at = uniform_entries(positions.geometry, u[0], mi.Point2f(u[1], u[2]))
     at = at._replace(weight=at.weight + dr.zeros(mi.Float, PLACES))
     point, known = (np.array(v) for v in points.nearest(at.p, at.n, mi.Bool(True)))
@@ -197,5 +199,7 @@ class _Tree:
             apart = dr.squared_norm(mi.Point3f(v.x, v.y, v.z) - x)
             d, end = dr.select(here, apart, d), dr.select(here, last, end)
             here &= apart <= v.w
+
+        # the radial density f there; 0 of places on another piece of the surface
         f = self.positions.table.pdf(dr.sqrt(dr.maximum(d, self.closest)))
         return dr.select(dr.gather(mi.UInt32, self.piece, k) == piece, f, 0), end

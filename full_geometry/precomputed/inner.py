@@ -38,6 +38,7 @@ MOST_G, LEFT = 0.3, 0.25  # largest |g|, and of (2l + 1) |g|^l the largest that 
 
 def bands(obj: TranslucentObject) -> int:
     """The largest l that phase functions of an object need."""
+    # the first l whose successor (2l + 3) |g|^(l + 1) is small
     g = max(abs(float(m.g)) for m in obj.media)
     return next(n for n in range(16) if (2 * n + 3) * g ** (n + 1) < LEFT)
 
@@ -129,6 +130,7 @@ class Events:
 
 def _occupied(x: np.ndarray, h: float) -> int:
     """How many cells of a width have places in them."""
+    # cells as one number of three times 21 bits
     i, j, k = np.floor((x - x.min(axis=0)) / h).astype(np.int64).T
     return len(np.unique((i << 42) | (j << 21) | k))
 

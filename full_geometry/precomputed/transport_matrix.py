@@ -41,7 +41,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -98,6 +98,7 @@ class Albedo:
     middle: np.ndarray | None = None
 
     def __call__(self, mu: mi.Float, paint: mi.Spectrum | None = None) -> mi.Spectrum:
+        # c, tilted by ln R where media have textures
         F = F_t(mu, opaque(self.eta))
         rows = [[opaque(v) for v in row] for row in self.c]
         if self.tilt is not None and paint is not None:
@@ -108,6 +109,7 @@ class Albedo:
     @cached_property
     def whole(self) -> np.ndarray:
         """∫ a(mu) mu dw of each channel."""
+        # 2 pi ∫ a mu dmu by the midpoint rule
         mu = (np.arange(256) + 0.5) / 256
         a = np.maximum(self.c @ mu ** np.arange(3)[:, None], 0) * F_t(mu, self.eta)
         return np.maximum(2 * np.pi * (a * mu).mean(axis=1), 1e-30)
@@ -138,6 +140,7 @@ class Incident:
 
 def bent(w: mi.Vector3f, n_out: mi.Normal3f, eta: float) -> mi.Vector3f:
     """A direction outside as the boundary bends it, turned back to the outer side."""
+    # Snell: mu_t² = 1 - (1 - mu²) / eta²
     mu = dr.dot(w, n_out)
     mu_t = dr.sqrt(1 - (1 - dr.minimum(dr.square(mu), 1)) * opaque(eta**-2))
     return mi.Vector3f((w - mu * n_out) * opaque(1 / eta) + mu_t * n_out)
@@ -266,6 +269,7 @@ class TransportMatrix:
 
     def _leaning(self, brought: np.ndarray) -> np.ndarray:
         """The slope over w_o of what entries bring, Σ_s t_s L_s (g_n n - g_d d), (points, channels, 3)."""
+        # at the exit the other end lies along -d, d from entry to exit
         upright, aside = (brought * np.take(self.g[:, :, k], self.step, axis=0) for k in range(2))
         return upright.sum(axis=1)[:, :, None] * self._n_out[:, None] - aside.transpose(0, 2, 1) @ self.toward
 
@@ -319,6 +323,7 @@ class TransportMatrix:
     def _by_ring(self, light: np.ndarray) -> np.ndarray:
         """Σ t L of each ring, (points, rings, channels)."""
         (count, _, size), rings = light.shape, len(ROUNDS)
+        # bins of (point, ring)
         at, brought = (np.arange(count)[:, None] * rings + self.ring).ravel(), self.t * light
         columns = [np.bincount(at, brought[:, :, c].ravel(), count * rings) for c in range(size)]
         return np.stack(columns, axis=1).reshape(count, rings, size)
@@ -334,6 +339,7 @@ class TransportMatrix:
 
     def _smoothed(self, values: np.ndarray, times: tuple[int, ...]) -> np.ndarray:
         """Values of rings, (points, rings, channels), each so many times."""
+        # rings farther out vary more slowly, and are smoothed more often
         smooth = np.copy(values)
         for k, rounds in enumerate(times):
             for _ in range(rounds):
@@ -343,6 +349,7 @@ class TransportMatrix:
 
 def count_of(obj: TranslucentObject) -> int:
     """How many points an object gets: so many that their distance is half a transport mean free path."""
+    # A (2 sigma_t')²
     sigma = np.mean([float(m.sigma_t_prime) for m in obj.media])
     return int(np.clip(obj.geometry.area * (PER_LENGTH * sigma) ** 2, FEWEST, MOST))
 
@@ -445,6 +452,7 @@ def _leanings(
 
 def _bent(w: np.ndarray, n: np.ndarray, eta: float) -> np.ndarray:
     """`bent` of arrays (..., 3)."""
+    # w / eta + (sqrt(1 - (1 - mu²) / eta²) - mu / eta) n
     mu = np.einsum("...k,...k->...", w, n)[..., None]
     return w / eta + (np.sqrt(1 - np.maximum(1 - mu**2, 0) / eta**2) - mu / eta) * n
 
@@ -460,11 +468,9 @@ def row_sums(row: np.ndarray, values: np.ndarray, rows: int) -> np.ndarray:
 
 
 def _geometry(points: SurfacePoints, near: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of entries the direction from their point to the exit, the distance over that of points, and a number of pairs.
+    """Directions from the points of entries to exits, distances over that of points, and classes of pairs.
 
-    The number is the same for all pairs in a like position.
-
-    That is by the distance, and the cosines of both normals to the line between the points.
+    Pairs of one class are in a like position, by the distance and the cosines of both normals to the line between them.
     """
     # ---- the line from the exit to the entry's point, and its length in distances of points
     p, n = (np.array(v, dtype=np.float32).T for v in (points.p, points.n))
@@ -523,6 +529,7 @@ class RowUniforms:
 
     def pair(self) -> list[Lattice]:
         """The next pair, for any row and place in it."""
+        # the R2 sequence of Roberts in a random order
         order = self._rng.permutation(self._n)
         return [self._lattice(order * r % 1.0) for r in R_2]
 
@@ -580,12 +587,13 @@ class _Brought(NamedTuple):
 
 def places_resolve(obj: TranslucentObject) -> bool:
     """Whether S of an object varies little from one of the places of `entries` to the next."""
+    # distance of places in transport mean free paths
     sigma = max(float(np.max(m.sigma_t_prime)) for m in obj.media)
     return sigma * float(np.sqrt(obj.geometry.area / PLACES)) < COARSEST
 
 
 def drawn(obj: TranslucentObject, points: SurfacePoints, samples: int, seed: int) -> DrawnEntries:
-    """As many entries for each point, by the proposals."""
+    """Entries drawn by the proposals, as many for each point."""
     n = samples // len(points)
     k = dr.arange(mi.UInt32, len(points) * n)
     each = dr.opaque(mi.UInt32, n)  # kernels are those of other numbers of points too
@@ -647,7 +655,9 @@ def _paint(obj: TranslucentObject, out: SurfacePoint) -> mi.Spectrum:
     return dr.zeros(mi.Spectrum, dr.width(out.p)) + (1 if obj.textured is None else obj.transport.paint(out))
 
 
-def _brought(obj: TranslucentObject, prepared: Any, out: SurfacePoint, entry: EntrySample, u: mi.Point2f) -> _Brought:
+def _brought(
+    obj: TranslucentObject, prepared: object, out: SurfacePoint, entry: EntrySample, u: mi.Point2f
+) -> _Brought:
     """S mu_i / (p(w_i) p(x_i)) of entries, along directions w_i for pairs of uniform numbers."""
     w_i, pdf = obj.proposals.sample_direction(entry, out, u)
     active = (entry.weight > 0) & (pdf > 0)
@@ -666,7 +676,7 @@ def _collected(
     near, known = places
     count, n = near.shape
 
-    def of_entries(v: Any) -> np.ndarray:
+    def of_entries(v: mi.Float | mi.Vector3f | mi.Spectrum) -> np.ndarray:
         """(points, entries, channels) of values of exits, which entries have in turn."""
         v = np.atleast_2d(np.array(v, dtype=np.float32)).T
         v = v.reshape(count, 1, -1, v.shape[1])
@@ -703,8 +713,8 @@ def _fitted(obj: TranslucentObject, mu: np.ndarray, S: np.ndarray) -> Albedo:
 
 
 def _tilted(albedo: Albedo, mu: np.ndarray, S: np.ndarray, paint: np.ndarray) -> Albedo:
-    """With c that varies with the reflectance: by least squares over S of points, (points, samples, channels)."""
-    # x = ln R, and S over what even light would bring
+    """a(mu) with c that varies with the reflectance: by least squares over S of points, (points, samples, channels)."""
+    # x = ln R, and S of each point scaled to the sum that a without tilt gives
     step, x = max(mu.size // FITTED, 1), np.log(np.maximum(paint, 1e-20))
     even = np.array(albedo(mi.Float(mu.ravel()))).T.reshape(S.shape).sum(axis=1) / np.maximum(S.sum(axis=1), 1e-30)
     mu, y = mu[:, ::step].astype(float), S[:, ::step] * even[:, None]
@@ -741,5 +751,7 @@ def _rows(
     known = found.S.mean(axis=1) / np.maximum(alpha.T.reshape(len(points), found.exits, -1).mean(axis=1), 1e-30)
     for _ in range(KNOWN_ROUNDS):
         known = points.smoothed(known)
+
+    # in the channels where alpha may stand for uniform light
     trusted = np.ravel(np.array(obj.transport.alpha.known[1])) > 0
     return trusted, np.where(trusted, known, even)

@@ -89,6 +89,7 @@ class SurfacePoints:
     @classmethod
     def of(cls, geometry: Geometry, count: int) -> SurfacePoints:
         """`count` points of an object."""
+        # a low-discrepancy set over the area, then points where random places have none in reach
         u = [mi.Float(v.astype(np.float32)) for v in lattice(count)]
         p, n, n_out, _, face, _ = uniform_entries(geometry, u[0], mi.Point2f(u[1], u[2]))
         dr.eval(p, n, n_out, face)
@@ -108,6 +109,7 @@ class SurfacePoints:
         if not len(missed):
             return self
         p, n = (np.array(v, dtype=float)[:, missed].T for v in (at.p, at.n))
+        # of the places that are missed one for all within h / 2 that face the same way
         near = cKDTree(p).query_ball_point(p, 0.5 * self.h)
         left, kept = np.ones(len(missed), dtype=bool), []
         for k, others in enumerate(near):
@@ -154,6 +156,7 @@ class SurfacePoints:
     def _of_like(self, x: np.ndarray) -> csr_array:
         """The weights of all points at all points, less where x is unlike, rows of sum 1."""
         near = self._blending.tocoo()
+        # times exp(-(|ln R_j - ln R_k| / LIKE)²), of the channel that differs most
         j, k = near.coords
         apart = np.abs(x[j] - x[k]).max(axis=1)
         w = csr_array((near.data * np.exp(-((apart / LIKE) ** 2)), (j, k)), shape=near.shape)
@@ -163,6 +166,7 @@ class SurfacePoints:
     def _blending(self) -> csr_array:
         """The weights of all points at all points, rows of sum 1."""
         p, n = np.array(self.p, dtype=float).T, np.array(self.n, dtype=float).T
+        # (1 - d² / h²)² max(n_j.n_k, 0)² of all pairs in reach, over the sum of a row
         d = cKDTree(p).sparse_distance_matrix(cKDTree(p), self.h, output_type="coo_matrix")
         j, k = d.coords
         facing = np.maximum((n[j] * n[k]).sum(axis=1), 0)
@@ -181,6 +185,7 @@ class SurfacePoints:
 
     def _near(self, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool, state: object, visit: Callable) -> tuple:
         """The sum of weights, and the state after `visit(j, w_j, state)` for all points in reach."""
+        # ---- the cell of the place, and the points that it lists
         h = opaque(self.h)
         cell = [mi.Int32(dr.floor((p[a] - opaque(self.low[a])) / h)) for a in range(3)]
         counts = [dr.opaque(mi.Int32, int(c)) for c in self.cells]
@@ -191,6 +196,7 @@ class SurfacePoints:
         begin = dr.gather(mi.UInt32, self.first, index, valid)
         end = dr.gather(mi.UInt32, self.first, index + 1, valid)
 
+        # ---- w_j = (1 - d² / h²)² max(n_j.n, 0)² of each
         def step(i: mi.UInt32, weight: mi.Float, state: object) -> tuple:
             j = dr.gather(mi.UInt32, self.members, i)
             d2 = dr.squared_norm(dr.gather(mi.Point3f, self.p, j) - p) / (h * h)
@@ -211,6 +217,7 @@ def _grid(p: np.ndarray, h: float) -> tuple[float, np.ndarray, np.ndarray, mi.UI
         if cells.prod() <= MOST_CELLS:
             break
         h *= 1.26
+    # each point is listed by all cells of the 27 about it that come nearer than h
     own = np.floor((p - low) / h).astype(int)
     place, point = [], []
     for dz in (-1, 0, 1):
@@ -221,6 +228,8 @@ def _grid(p: np.ndarray, h: float) -> tuple[float, np.ndarray, np.ndarray, mi.UI
                 kept = ((cell >= 0) & (cell < cells)).all(axis=1) & (((near - p) ** 2).sum(axis=1) < h * h)
                 place.append((cell[kept, 2] * cells[1] + cell[kept, 1]) * cells[0] + cell[kept, 0])
                 point.append(np.flatnonzero(kept))
+
+    # lists one after the other, and where that of each cell begins
     place, point = np.concatenate(place), np.concatenate(point)
     order = np.argsort(place, kind="stable")
     first = np.searchsorted(place[order], np.arange(cells.prod() + 1))

@@ -45,6 +45,7 @@ def _class(variant: str) -> type:
         def __init__(self, seed: int, pixels: int, first: int, spp: int) -> None:
             mi.Sampler.__init__(self, mi.Properties())
             self.set_sample_count(spp)
+            # sample i of a pixel in reversed bits, and the key of the pixel
             lane = dr.arange(mi.UInt32, pixels * spp)
             pixel = lane // dr.opaque(mi.UInt32, spp)
             self._reversed = dr.brev(lane - pixel * dr.opaque(mi.UInt32, spp) + dr.opaque(mi.UInt32, first))
@@ -54,6 +55,7 @@ def _class(variant: str) -> type:
             return _fraction(scrambled(self._reversed, self._next()))
 
         def next_2d(self, active: mi.Bool = True) -> mi.Point2f:
+            # shuffle i, then scramble the digits of x and y
             key = self._next()
             i, key_x = dr.brev(scrambled(self._reversed, key)), hashed(key)
             digits = scrambled(i, key_x), scrambled(second(i), hashed(key_x))
@@ -79,6 +81,7 @@ def hashed(x: mi.UInt32) -> mi.UInt32:
 
 def scrambled(x: mi.UInt32, key: mi.UInt32) -> mi.UInt32:
     """Nested uniform scrambling of a fraction whose first digit is the lowest bit."""
+    # each multiple of an even factor lets a digit flip all higher ones (Laine and Karras 2011)
     x = x + key
     for factor in (0x6C50B47C, 0xB82F1E52, 0xC7AFE638, 0x8D22F6E6):
         x = x ^ (x * factor)

@@ -54,6 +54,7 @@ def sample_emitter(
         active: lanes that count.
         differentiable: whether the light carries derivatives by parameters of emitters, with the direction held.
     """
+    # w and p_e are held in derivatives, L_e is not
     with dr.suspend_grad():
         ds, light = scene.sample_emitter_direction(at, u, False, active)
         inverse = dr.select(ds.pdf > 0, dr.rcp(ds.pdf), 0)
@@ -115,5 +116,6 @@ def unmasked_surface(
     wrapping: Wrapping, obj: Geometry, si: mi.SurfaceInteraction3f, d: mi.Vector3f, u: mi.Float, here: mi.Bool
 ) -> mi.BSDFPtr:
     """The BSDF that masks and blends around the surface of an object leave for a ray along d, by a uniform number."""
+    # a ray that a mask has let in arrives at a closed object from inside, where there is nothing
     behind = (dr.dot(si.n, d) * obj.side(si.prim_index, here) > 0) & obj.closed
     return wrapping.draw(si, behind, u, here)

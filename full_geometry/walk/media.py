@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import drjit as dr
@@ -56,7 +56,7 @@ class InclusionTable:
 
     scene: mi.Scene
     instance_table: InstanceTable
-    tables: dict[str, Any]
+    tables: dict[str, mi.Int32 | mi.Bool]
     lights: list[tuple[mi.Emitter, int]]
 
     @classmethod
@@ -137,6 +137,7 @@ def _largest_first(result: list[Inclusion], holders: InstanceTable) -> list[Incl
 
 
 def _check(result: list[Inclusion], objects: list[Geometry], instance_table: InstanceTable) -> None:
+    # what refracts is wholly inside or outside, in objects without textures whose orders all count
     for inclusion in result:
         holder = objects[instance_table.kind[inclusion.object]]
         surfaces = [surface_of(holder.shape)]
@@ -213,7 +214,7 @@ class HeterogeneousMedia:
         """Extinction of object k at the point p, 1/(scene unit)."""
         return _row(self.factor, k) * _eval(self.densities, k, p)
 
-    def coefficients(self, k: mi.Int32, p: mi.Point3f) -> tuple[Any, Any]:
+    def coefficients(self, k: mi.Int32, p: mi.Point3f) -> tuple[mi.Spectrum, mi.Spectrum]:
         """sigma_t and sigma_s of object k at the point p, 1/(scene unit)."""
         sigma_t = self.sigma_t(k, p)
         return sigma_t, sigma_t * _row(self.albedo, k) * _eval(self.albedos, k, p)
@@ -251,6 +252,7 @@ class HeterogeneousMedia:
 
 def per_channel(rows: list[float | np.ndarray], scale: float) -> list[mi.Float]:
     """A table with one column per channel from a number, or one per channel, of each object."""
+    # (objects, channels), as one array for each channel
     n = len(mi.Spectrum(0))
     values = np.array([np.broadcast_to(row, n) for row in rows], dtype=float) * scale
     return [mi.Float(values[:, c].tolist()) for c in range(n)] if len(rows) else []
@@ -268,6 +270,7 @@ def _eval(volumes: list[mi.Volume | None], k: mi.Int32, p: mi.Point3f) -> mi.Spe
     """The value of the volume of object k, 1 where it has none; Mitsuba's volumes cannot be called by pointers."""
     if len(volumes) == 1:
         return eval_volume(volumes[0], p)
+    # one branch for each object
     value = mi.Spectrum(1)
     for number, volume in enumerate(volumes):
         if volume is not None:
@@ -491,6 +494,7 @@ class WalkMedia:
         """What a walk takes that enters object k at a point of its surface: the medium there; () if none is carried."""
         if not self.carried:
             return ()
+        # of the object, or by what its textures or spectra are at the point
         sigma_t, sigma_s, g = (self.spectrum(key, k) for key in ("sigma_t", "sigma_s", "g"))
         for number, inside in enumerate(self.specs):
             here = active & self.has_shape(k, number)
@@ -542,6 +546,7 @@ class WalkMedia:
         medium: WalkMedium | tuple[()] = (),
     ) -> mi.Spectrum:
         """exp(-∫ sigma_t) over a distance along a ray inside object k; by ratio tracking where a medium varies."""
+        # exp(-sigma_t d) of a homogeneous medium
         own = dr.exp(-(medium.sigma_t if medium else self.spectrum("sigma_t", k)) * distance)
         if self.heterogeneous is None:
             return own
@@ -611,6 +616,8 @@ class WalkMedia:
             si = around.bent(si, self.has_shape(k, number))
         if all(obj.upright for obj in self.objects) and not self.any_bent:
             return si
+
+        # the geometric normal outwards, the shading normal on the same side, and wi in the new frame
         n = dr.select(k >= 0, si.n * self.side(dr.maximum(k, 0), si.prim_index), si.n)
         flip = (k >= 0) & (dr.dot(si.sh_frame.n, n) < 0)
         si.n, n = n, si.sh_frame.n
@@ -687,6 +694,7 @@ def _boundary(eta: float) -> mi.BSDF:
 
 def walk_media(obj: TranslucentObject) -> WalkMedia:
     """One object alone, with a smooth boundary and as if it were empty; made once for each."""
+    # one medium with a value for each channel, behind a smooth boundary of its index
     result = _OF_OBJECT.get(obj)
     if result is None:
         medium, eta = obj.media[0], obj.media[0].eta
@@ -710,6 +718,7 @@ def media_within(obj: TranslucentObject) -> WalkMedia:
     if inclusions is None:
         return walk_media(obj)
     if obj not in _WITHIN:
+        # object 0 is that around all others
         alone, shapes = walk_media(obj), [s for s, inside in zip(inclusions.shapes, inclusions.specs) if inside]
         objects = [obj.geometry, *(analyse_shape(shape) for shape in shapes)]
         inner = InclusionTable.of(scene_of([obj.geometry.shape, *inclusions.shapes]), objects)
@@ -726,5 +735,6 @@ def _bounds(scene: mi.Scene) -> mi.BoundingBox3f:
     box = scene.bbox()
     if not box.valid():
         return box
+    # walks beyond it end
     margin = 1e-3 * (box.max - box.min)
     return mi.BoundingBox3f(mi.Point3f(box.min - margin), mi.Point3f(box.max + margin))

@@ -7,7 +7,7 @@ Dr.Jit, which goes through the loop beside the walk: light for images, exits for
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -92,9 +92,11 @@ def fly(
     collides = t < reach
     scatters = collides if u is None else collides & (u * pick(m.majorant, channel) < pick(m.sigma_t, channel))
     null = mi.Bool(False) if u is None else collides & ~scatters
+    # one channel: f / p is the albedo at a scattering event, else 1
     if len(weight) == 1:
         value = dr.select(scatters, m.sigma_s / m.sigma_t, 1)
         return Flight(scatters, null, weight * value, density)
+
     # f_c and p_c, both over exp(-M_k t) of the walk's channel
     through = dr.exp(-(m.majorant - pick(m.majorant, channel)) * dr.minimum(t, reach))
     otherwise = mi.Spectrum(1) if u is None else dr.select(null, dr.maximum(m.majorant - m.sigma_t, 0), 1)
@@ -360,7 +362,7 @@ class Walker:
         return self.visitor.crossing(walk, record, crossing)
 
 
-def _pass(walk: Walk, record: Record, *rest: Any) -> tuple[Walk, Record]:
+def _pass(walk: Walk, record: Record, *rest: object) -> tuple[Walk, Record]:
     return walk, record
 
 
@@ -525,6 +527,7 @@ def walk_from(
         ValueError: there is no object k, its medium has textures and is not known at the start, or the arrays of
             `start` are of different lengths.
     """
+    # ---- lanes take walks index, index + lanes, ... until none is left
     n = _check(media, k, start)
     if n == 0:
         return
@@ -537,10 +540,12 @@ def walk_from(
         index = index + step
         return _enter(media, k, start, total, index, walk.rng), index, visitor.begun(index)
 
+    # a free flight where a walk is alive, another walk where it has ended
     def body(walk: Walk, index: mi.UInt32, record: Record) -> tuple[Walk, mi.UInt32, Record]:
         walk, record = dr.if_stmt((walk, record), walk.alive, walker.step, lambda *s: s, label="inside")
         return dr.if_stmt((walk, index, record), ~walk.alive, renew, lambda *s: s, label="renew")
 
+    # ---- one loop over all walks
     seeds = seed if isinstance(seed, tuple) else (seed,)
     index = dr.arange(mi.UInt32, lanes)
     walk = _enter(media, k, start, total, index, generator(mi, lanes, pass_seed(*seeds)))
@@ -580,6 +585,8 @@ def _enter(
     ctx.type_mask = mi.BSDFFlags.Transmission
     bs, value = sample_bsdf(media.boundary(k), si, rng, ctx)
     d, _ = sided(si, bs.wo)
+
+    # ---- the medium of the start, for the whole walk
     medium: WalkMedium | tuple[()] = ()
     if media.carried:
         of_exit = dr.gather(MediumAt, start.medium, index, known)

@@ -60,6 +60,7 @@ class Score:
 
 def phase_score(g: mi.Spectrum, cosine: mi.Float) -> mi.Spectrum:
     """d log p / dg of the Henyey-Greenstein phase function, for each channel."""
+    # p = (1 - g²) / (4 pi (1 + g² - 2 g cos)^(3/2))
     parts = [3 * (cosine - c) / (1 + dr.square(c) - 2 * c * cosine) - 2 * c / (1 - dr.square(c)) for c in g]
     return mi.Spectrum(parts)
 
@@ -154,6 +155,7 @@ class KeptStays:
 
     def slots(self, L: mi.Spectrum) -> Iterator[tuple[mi.Int32, Place, Score]]:
         """For each slot, of the light L of all paths: the number of the object, the place and the slopes."""
+        # the last slot counts for all stays from there on
         for slot in range(SLOTS):
             at = dr.arange(mi.UInt32, self.paths) + slot * self.paths
             number, place, p, q = (_gathered(v, at) for v in (self.number, self.place, self.p, self.q))
@@ -192,6 +194,7 @@ class PathScores:
     @classmethod
     def of(cls, media: WalkMedia, paths: int) -> PathScores:
         """Sums of 0 for so many paths."""
+        # rows of objects of one medium; those with textures have slots
         numbers = [k for k, _ in followed(media)]
         rows = mi.Int32([numbers.index(k) if k in numbers else -1 for k in media.instance_table.kind])
         room, textured = paths * len(numbers), followed_textures(media)
@@ -240,6 +243,7 @@ class ScoreVisitor:
         return replace(r, record=replace(after, slopes=slopes), stay=stay)
 
     def event(self, walk: Walk, record: StayRecord, event: Event) -> tuple[Walk, StayRecord]:
+        # the event counts before its light does: light there has scattered at it
         stay = record.stay.flown(walk, event.p, self.media).scattered(event)
         before = mi.Spectrum(record.record.L)
         walk, after = self.visitor.event(walk, record.record, event)
@@ -267,6 +271,7 @@ class ScoreVisitor:
 
     def end(self, record: StayRecord) -> StayRecord:
         """Store the stay and begin another."""
+        # p and q of the stay; light that follows belongs to the next one
         self.scores.add(record)
         lanes = dr.width(record.index)
         painted = dr.gather(mi.Bool, self.scores.painted, record.stay.object)
@@ -316,6 +321,7 @@ class ScoredExitVisitor:
         return walk, record
 
     def crossing(self, walk: Walk, record: ScoredWalk, crossing: Crossing) -> tuple[Walk, ScoredWalk]:
+        # n, d and d log p / dg of the walk, at the number of its exit
         leaves = walk.alive & crossing.leaves
         for target, value in zip(vars(self.scores).values(), vars(record.stay.score).values()):
             dr.scatter(target, value, record.index, leaves)
@@ -332,6 +338,7 @@ def scored_exits(
         ValueError: as there.
     """
     n = dr.width(start.p)
+    # the walks of `exits` with the same random numbers
     visitor = ScoredExitVisitor(ExitVisitor.of(n, fewest), media, Score.zeros(n))
     dr.eval(visitor.scores)
     walk_from(media, k, start, visitor, seed)
@@ -366,6 +373,7 @@ def followed_textures(media: WalkMedia) -> dict[int, TexturedMedium]:
     Raises:
         ValueError: the albedo of one of them is 0 somewhere.
     """
+    # d log f has n / albedo: no channel may be black
     result = {}
     for k, (obj, inside) in enumerate(zip(media.objects, media.specs)):
         if inside.textured is None:

@@ -76,6 +76,7 @@ class StraightLight:
 
     def pdf_emitter(self, at: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool) -> mi.Float:
         """Density by which `light` draws a direction to an emitter, 1/sr; 0 of emitters that are not sampled."""
+        # p_e = pdf / n of the emitters that are sampled
         active = active & (looked_up(self.tables["index"], ds.emitter, -1) >= 0)
         return dr.select(active, ds.emitter.pdf_direction(at, ds, active) / len(self.emitters), 0)
 
@@ -104,6 +105,7 @@ class StraightLight:
 
     def _way(self, event: Event, ds: mi.DirectionSample3f, active: mi.Bool, rng: mi.PCG32) -> LightWay:
         """Through the object to the emitter, or to what is between."""
+        # ---- segments inside the object and outside, until the emitter or something else is met
         media, k, medium, again = self.media, event.object, event.medium, self.passes_again(event.object)
         reach = FARTHEST / dr.min(event.m.mean_t)
 
@@ -142,6 +144,7 @@ def find_straight_light(scene: mi.Scene, media: WalkMedia, again: bool, scored: 
     emitters = [emitter for emitter in scene.emitters() if "Constant" not in emitter.class_name()]
     if not media.any_straight or not emitters:
         return None
+    # emitters by number, and their numbers by what Dr.Jit's registry calls them
     pointers = [mi.EmitterPtr(emitter) for emitter in emitters]
     numbers = mi.UInt32(pointer_numbers(pointers))
     tables = {"pointer": numbers, "index": by_pointer(pointers, np.arange(len(pointers)), -1)}
