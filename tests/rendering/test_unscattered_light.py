@@ -247,7 +247,7 @@ FORWARD = {"sigma_s": "10.0,15.0,20.0", "sigma_a": "0.01,0.05,0.3", "eta": 1.4}
 @pytest.mark.parametrize("g", ["0.9", "0.95,0.8,0.6", "-0.6"])
 def test_precomputed_light_of_an_even_sky_has_the_mean_of_sampled_light_at_any_g(g: str) -> None:
     surface = {**(MEDIUM if g == "-0.6" else FORWARD), "g": g}
-    _compare(surface, 0.003, spp=512, light={"type": "constant"})
+    _compare(surface, 0.003, spp=1024, light={"type": "constant"})
 
 
 @pytest.mark.slow
