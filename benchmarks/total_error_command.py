@@ -37,6 +37,8 @@ def total_error_command(
     use_mitsuba("llvm_ad_rgb")
     from benchmarks.speeds import LIGHTS, OTHER_LIGHTS, LitObject
     from benchmarks.total_error import TotalErrors, total_errors
+    from benchmarks.total_error_plot import draw
+    from halfspace_sss.comparison.style import saved
 
     times, lights = tuple(sorted(seconds or TotalErrors.seconds)), tuple(light or LIGHTS)
     for name in lights:
@@ -52,5 +54,9 @@ def total_error_command(
         table = total_errors(cases, how, out / "work", lambda what, k, n: bar.show(k, n, what))
     text = markdown(table.round(3))
     csv = table.to_csv(index=False, lineterminator="\n")
-    write_together({out / "total_error.csv": csv, out / "total_error.md": text})
+    drawn = saved(draw(table))
+    write_together(
+        {out / "total_error.csv": csv, out / "total_error.md": text, out / "total_error.pdf": drawn["pdf"],
+         out / "total_error.png": drawn["png"]}
+    )  # fmt: skip
     console().print(text, highlight=False, markup=False, soft_wrap=True)
