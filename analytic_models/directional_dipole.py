@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from analytic_models._diffusion import DiffuseBoundary, safe_differences
-from halfspace_sss.interface.model import BSSRDF, Query
+from halfspace_sss.interface.model import BSSRDF
+from halfspace_sss.interface.query import Query
 from halfspace_sss.physics.medium import Medium
 
 R_MIN = 1e-6  # mean free paths

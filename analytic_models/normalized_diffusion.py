@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from analytic_models._diffusion import unit_gauss
-from halfspace_sss.interface.model import Query, Separable, exit_normaliser
+from halfspace_sss.interface.model import Separable, exit_normaliser
+from halfspace_sss.interface.query import Query
 from halfspace_sss.physics.fresnel import C_1
 from halfspace_sss.physics.medium import Medium
 

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from halfspace_sss.interface.model import Query, Separable, exit_normaliser
+from halfspace_sss.interface.model import Separable, exit_normaliser
+from halfspace_sss.interface.query import Query
 from halfspace_sss.physics.fresnel import boundary_A_jensen
 from halfspace_sss.physics.medium import Medium
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from halfspace_sss.arrays import broadcast_query, is_torch, library
-from halfspace_sss.interface.model import Query
+from halfspace_sss.interface.query import Query
 from halfspace_sss.neural.features import medium_features, symmetric_features, travel
 from halfspace_sss.neural.hypernetwork import N_TERMS, Hypernetwork, Layers, log_calibration
 from halfspace_sss.neural.perceptron import Perceptron, cooperative, silu

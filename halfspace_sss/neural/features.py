@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from halfspace_sss.arrays import library
-from halfspace_sss.interface.model import Query
+from halfspace_sss.interface.query import Query
 from halfspace_sss.physics.backbone import U_MAX, warp
 
 N_FEATURES, N_MEDIUM = 13, 9

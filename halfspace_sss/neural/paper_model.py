@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from halfspace_sss.interface.model import BSSRDF, Query
+from halfspace_sss.interface.model import BSSRDF
+from halfspace_sss.interface.query import Query
 from halfspace_sss.neural.material_model import load_network
 from halfspace_sss.neural.network import RELU, Network
 from halfspace_sss.neural.store import find_weights, load_weights, record_number

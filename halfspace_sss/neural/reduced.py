@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from halfspace_sss.arrays import library
-from halfspace_sss.interface.model import Query
+from halfspace_sss.interface.query import Query
 from halfspace_sss.neural.features import symmetric_features, travel
 from halfspace_sss.neural.hypernetwork import log_calibration
 from halfspace_sss.neural.network import Network

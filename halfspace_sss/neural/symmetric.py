@@ -7,7 +7,8 @@ import hashlib
 from collections.abc import Sequence
 from typing import Any
 
-from halfspace_sss.interface.model import BSSRDF, Query
+from halfspace_sss.interface.model import BSSRDF
+from halfspace_sss.interface.query import Query
 from halfspace_sss.neural.features import symmetric_features, travel
 from halfspace_sss.neural.hypernetwork import log_calibration
 from halfspace_sss.neural.network import Network
