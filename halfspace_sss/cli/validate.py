@@ -40,26 +40,19 @@ def row_filter(text: str | None) -> Callable[[Truth], bool] | None:
 def summary(comparisons: list[Comparison]) -> list[dict[str, Any]]:
     """One record per quantity: rows, largest and rms z, largest standard error relative to the traced value.
 
-    `dim` marks reflectances of albedo below 0.5, of which larger relative errors are asked.
+    Reflectances of albedo below 0.5, of which larger relative errors are asked, are apart.
     """
     groups: dict[str, list[Comparison]] = {}
     for c in comparisons:
         dim = c.truth.measure in ("R_d", "R_total") and c.truth.medium.albedo < 0.5
         groups.setdefault(c.truth.quantity + (", albedo < 0.5" if dim else ""), []).append(c)
-    return [
-        {
-            "quantity": name,
-            "rows": len(group),
-            "max_abs_z": max(abs(c.z) for c in group),
-            "rms_z": math.sqrt(sum(c.z**2 for c in group) / len(group)),
-            "max_relative_error": max(_relative_error(c) for c in group),
-        }
-        for name, group in sorted(groups.items())
-    ]
-
-
-def _relative_error(c: Comparison) -> float:
-    return c.standard_error / abs(c.reflected) if c.reflected else math.inf
+    results = []
+    for name, group in sorted(groups.items()):
+        z = [abs(c.z) for c in group]
+        error = max(c.standard_error / abs(c.reflected) if c.reflected else math.inf for c in group)
+        about = {"quantity": name, "rows": len(group), "max_abs_z": max(z)}
+        results.append(about | {"rms_z": math.hypot(*z) / math.sqrt(len(z)), "max_relative_error": error})
+    return results
 
 
 def _record(c: Comparison) -> dict[str, Any]:
