@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from full_geometry.cli.variants import Variant, use_mitsuba
+from full_geometry.cli.variants import SceneOptions, use_mitsuba
 from halfspace_sss.cli import shared
 from halfspace_sss.cli.errors import write_errors
 
@@ -24,21 +24,20 @@ DEFINITION = (
 
 
 def errors_object(
+    on: SceneOptions,
     scene: Annotated[Path, typer.Option(help="Mitsuba XML file with the object.")],
     object: shared.ObjectId = None,  # noqa: A002
     model: shared.Models = None,
     exits: Annotated[int, typer.Option(help="Random exits.", parser=shared.whole)] = 256,
     seed: shared.Seed = 0,
-    define: shared.Define = None,
-    variant: Variant = "llvm_ad_rgb",
     out: shared.OutFolder = Path("errors"),
 ) -> None:
     """Compare models of an object of a scene with walks: radiance of random exits; written as CSV and JSON."""
     from halfspace_sss.provenance import check_folder
 
-    parameters = shared.defined(define)
+    parameters = on.parameters()
     check_folder(out)
-    use_mitsuba(variant)
+    use_mitsuba(on.variant)
     import pandas
 
     from full_geometry.learning.learners import object_errors

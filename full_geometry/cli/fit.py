@@ -29,18 +29,25 @@ class DescentOptions:
     seed: shared.Seed = 0
 
 
+@dataclass(frozen=True)
+class FittedOptions:
+    """What is fitted."""
+
+    parameter: Annotated[
+        str, typer.Option(help="Of albedo, reflectance, sigma_t, mfp, g; the texture, where there is one.")
+    ] = "albedo,sigma_t"
+    model: Annotated[str, typer.Option(help="translucent_walk, neural_shape, or a model of the half-space.")] = (
+        "translucent_walk"
+    )
+    object: shared.ObjectId = None
+
+
 def fit(
     context: typer.Context,
     scene: Annotated[Path, typer.Argument(help="Mitsuba XML file with the cameras, the lights and a first medium.")],
     images: Annotated[Path, typer.Option(help="JSON file of the views, see `full_geometry.inverse.read_views`.")],
+    fitted: FittedOptions,
     descent: DescentOptions,
-    parameter: Annotated[
-        str, typer.Option(help="Of albedo, reflectance, sigma_t, mfp, g; the texture, where there is one.")
-    ] = "albedo,sigma_t",
-    model: Annotated[
-        str, typer.Option(help="translucent_walk, neural_shape, or a model of the half-space.")
-    ] = "translucent_walk",
-    object: shared.ObjectId = None,  # noqa: A002
     work: Annotated[Path | None, typer.Option(help="Folder where an interrupted fit goes on.")] = None,
     variant: Variant = "llvm_ad_rgb",
     out: shared.OutFolder = Path("fit"),
@@ -57,13 +64,14 @@ def fit(
 
     settings = inverse.FitSettings(**vars(descent))
     check_folder(out)
-    names = [name.strip() for name in parameter.split(",")]
+    names = [name.strip() for name in fitted.parameter.split(",")]
     with shared.Bar("fit") as bar:
-        found = inverse.fit(scene, inverse.read_views(images), names, model, object, settings, work, bar.show)
+        views = inverse.read_views(images)
+        found = inverse.fit(scene, views, names, fitted.model, fitted.object, settings, work, bar.show)
     shared.say(*found.lines())
     for sentence in found.told:
         shared.tell(sentence)
-    shared.say_files(_write(found, scene, object, out, context.find_object(Drawers)))
+    shared.say_files(_write(found, scene, fitted.object, out, context.find_object(Drawers)))
 
 
 def _write(found: MaterialFit, scene: Path, name: str | None, out: Path, drawers: Drawers | None) -> list[Path]:

@@ -83,18 +83,25 @@ class TransportOptions:
         return {"train_seconds": self.train_seconds, "train_error": self.train_error}
 
 
+@dataclass(frozen=True)
+class ImageOptions:
+    """Which image, and what is made of it."""
+
+    seed: shared.Seed = 0
+    sensor: Annotated[str, typer.Option(help="Number of the sensor, several as 0,1, or all.")] = "0"
+    denoise: Annotated[bool, typer.Option("--denoise", help="An image without noise beside the other.")] = False
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with the unfinished or finished render of the same settings.")
+    ] = False
+
+
 def render(
     context: typer.Context,
     scene: Annotated[Path, typer.Argument(help="Mitsuba XML file whose objects use the BSDF `translucent`.")],
     transport: TransportOptions,
     until: UntilOptions,
-    seed: shared.Seed = 0,
-    sensor: Annotated[str, typer.Option(help="Number of the sensor, several as 0,1, or all.")] = "0",
+    images: ImageOptions,
     define: shared.Define = None,
-    denoise: Annotated[bool, typer.Option("--denoise", help="An image without noise beside the other.")] = False,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with the unfinished or finished render of the same settings.")
-    ] = False,
     variant: RenderVariant = "llvm_ad_rgb",
     out: shared.OutFolder = Path("render"),
 ) -> None:
@@ -112,12 +119,12 @@ def render(
     from halfspace_sss.provenance import check_folder
 
     limits, parameters = until.limits(), shared.defined(define)
-    drawers = _drawers(context, denoise)
+    drawers = _drawers(context, images.denoise)
     check_folder(out)
-    loaded = open_scene(scene, transport.model, transport.orders, parameters, transport.settings(denoise))
-    sensors = _sensors(sensor, loaded)
+    loaded = open_scene(scene, transport.model, transport.orders, parameters, transport.settings(images.denoise))
+    sensors = _sensors(images.sensor, loaded)
     shared.say(*chosen(loaded, loaded.integrator()).get("choices", {}).values())
-    if denoise and any(not loaded.sensors()[k].film().rfilter().is_box_filter() for k in sensors):
+    if images.denoise and any(not loaded.sensors()[k].film().rfilter().is_box_filter() for k in sensors):
         shared.tell(
             "the film has no box filter: the denoiser keeps most of the noise that other filters spread over pixels"
         )
@@ -125,10 +132,11 @@ def render(
         name = [scene.stem, transport.model or "scene", transport.light or "", f"sensor{k}" if k else ""]
         file = out / f"{'_'.join(filter(None, name))}.exr"
         with one_writer(file):
-            result = _rendered(loaded, file, limits, {"seed": seed, "sensor": k, **transport.training()}, resume)
+            which = {"seed": images.seed, "sensor": k, **transport.training()}
+            result = _rendered(loaded, file, limits, which, images.resume)
             emission = result.mean[..., -3:] if getattr(loaded.integrator(), "layers", False) else None
             told, error = _numbers(result), _error(result)
-            picture = Picture(file.stem, _colours(result.mean), told, error, loaded, k, denoise, emission)
+            picture = Picture(file.stem, _colours(result.mean), told, error, loaded, k, images.denoise, emission)
             files = _publish(picture, file, drawers)
             shared.say(f"{result.spp} samples a pixel in {result.seconds:.1f} s; {error}")
             shared.say_files(files)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from full_geometry.cli.variants import Drawers, Variant, use_mitsuba
+from full_geometry.cli.variants import Drawers, SceneOptions, use_mitsuba
 from halfspace_sss.cli import shared
 
 if TYPE_CHECKING:
@@ -40,21 +40,20 @@ class MeasuringOptions:
         float, typer.Option(help="Learn objects without weights first, for so many seconds each; the time counts.")
     ] = 0.0
     sensor: shared.SensorNumber = 0
+    seed: shared.Seed = 0
 
 
 def trade(
     context: typer.Context,
     wanted: TradeOptions,
     measuring: MeasuringOptions,
+    on: SceneOptions,
     what: Annotated[
         str | None,
         typer.Argument(help="A Mitsuba XML file, or a material for curves.", show_default="the shipped table"),
     ] = None,
     model: shared.Models = None,
     r: Annotated[str | None, typer.Option(help="Of a material: smallest and largest distance, mm, as 0.1,20.")] = None,
-    seed: shared.Seed = 0,
-    define: shared.Define = None,
-    variant: Variant = "llvm_ad_rgb",
     out: shared.OutFolder = Path("trade"),
 ) -> None:
     """Measure speed against accuracy: a table, a recommendation, CSV, JSON, and the figure and page of a scene."""
@@ -64,21 +63,22 @@ def trade(
     check_interval("tolerance", wanted.tolerance, 1e-4, 10.0)
     check_count("images", wanted.images, 1)
     if what is None:
-        _check_left_out("without a scene or a material", seconds=wanted.seconds, model=model, r=r, define=define)
+        _check_left_out("without a scene or a material", seconds=wanted.seconds, model=model, r=r, define=on.define)
         _shipped()
     elif Path(what).suffix == ".xml" or Path(what).is_file():
         _check_left_out("with a scene", r=r)
-        parameters = shared.defined(define)
+        parameters = on.parameters()
         check_folder(out)
-        use_mitsuba(variant)
-        how = {"seconds": measuring.assess, "models": model or None, "sensor": measuring.sensor, "seed": seed}
+        use_mitsuba(on.variant)
+        how = {"seconds": measuring.assess, "models": model or None, "sensor": measuring.sensor, "seed": measuring.seed}
         how |= {"parameters": parameters, "train_seconds": measuring.train_seconds}
         _scene(Path(what), wanted, measuring.every, how, out, context.find_object(Drawers))
     else:
-        _check_left_out("with a material", seconds=wanted.seconds, define=define)
+        _check_left_out("with a material", seconds=wanted.seconds, define=on.define)
         check_folder(out)
         limits = None if r is None else tuple(shared.numbers("r", r))
-        _material(what, {"r": limits, "tolerance": wanted.tolerance, "models": model or None, "seed": seed}, out)
+        how = {"r": limits, "tolerance": wanted.tolerance, "models": model or None, "seed": measuring.seed}
+        _material(what, how, out)
 
 
 def _check_left_out(beside: str, **options: Any) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from full_geometry.cli.errors import DEFINITION, object_table
-from full_geometry.cli.variants import Variant, use_mitsuba
+from full_geometry.cli.variants import SceneOptions, use_mitsuba
 from halfspace_sss.cli import shared
 from halfspace_sss.cli.train import ResultOptions, Work, need_torch
 
@@ -21,6 +21,7 @@ Seconds = Annotated[float, typer.Option(help="Time for data and fit, without com
 
 def train_object(
     scene: Annotated[Path, typer.Option(help="Mitsuba XML file with the object.")],
+    on: SceneOptions,
     results: ResultOptions,
     places: shared.Places,
     object: Annotated[  # noqa: A002
@@ -37,13 +38,11 @@ def train_object(
             help="neural_shape or a half-space model, which the network corrects.", show_default="better_dipole"
         ),
     ] = None,
-    define: shared.Define = None,
-    variant: Variant = "llvm_ad_rgb",
 ) -> None:
     """Train the networks of objects of a scene, which `render` then knows, and say how wrong they are."""
     need_torch()
-    parameters = shared.defined(define)
-    use_mitsuba(variant)
+    parameters = on.parameters()
+    use_mitsuba(on.variant)
     from full_geometry.learning.learners import learner
     from full_geometry.objects.objects import object_of
     from full_geometry.scenes.scene_files import load_objects
@@ -57,7 +56,7 @@ def train_object(
     learnt: dict[str, LearntObject] = {}
     with places.executor() as executor, shared.Bar("training") as bar:
         results = results.elsewhere() if executor else results
-        of, parts = (scene.absolute() if executor else scene, parameters, variant, model), {}
+        of, parts = (scene.absolute() if executor else scene, parameters, on.variant, model), {}
         how = {"seconds": seconds, "target_error": results.target_error, "seed": results.seed, "folder": results.out}
         how |= {"base_model": base_model} if base_model is not None else {}
         for name in dict.fromkeys(object or (None,)):

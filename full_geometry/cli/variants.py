@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from halfspace_sss.backend import BackendError, prepare_llvm
+from halfspace_sss.cli import shared
 from halfspace_sss.cli.interrupts import interrupts
 
 if TYPE_CHECKING:
@@ -20,6 +21,18 @@ if TYPE_CHECKING:
 Variant = Annotated[
     Literal["llvm_ad_rgb", "llvm_ad_mono", "cuda_ad_rgb", "cuda_ad_mono"], typer.Option(help="Variant of Mitsuba.")
 ]
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """How a scene is loaded."""
+
+    define: shared.Define = None
+    variant: Variant = "llvm_ad_rgb"
+
+    def parameters(self) -> dict[str, str]:
+        """Values of $NAME."""
+        return shared.defined(self.define)
 
 
 @dataclass(frozen=True)

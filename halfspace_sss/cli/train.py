@@ -46,18 +46,25 @@ def need_torch() -> None:
         raise ValueError("training needs torch: `pip install halfspace-sss[train]`")
 
 
+@dataclass(frozen=True)
+class RecipeOptions:
+    """The model of a medium, and how long it is trained."""
+
+    model: Annotated[Literal["neural_material", "neural_paper"], typer.Option(help="The model that is trained.")] = (
+        "neural_material"
+    )
+    fast: Annotated[bool, typer.Option("--fast", help="A quarter of the time, about twice the error.")] = False
+    steps: Steps = None
+    backend: shared.Backend = "llvm"
+
+
 def train_material(
     stated: shared.MediumOptions,
+    wanted: RecipeOptions,
     results: ResultOptions,
     places: shared.Places,
     material: shared.Materials = None,
     channel: shared.Channels = None,
-    model: Annotated[
-        Literal["neural_material", "neural_paper"], typer.Option(help="The model that is trained.")
-    ] = "neural_material",
-    fast: Annotated[bool, typer.Option("--fast", help="A quarter of the time, about twice the error.")] = False,
-    steps: Steps = None,
-    backend: shared.Backend = "llvm",
 ) -> None:
     """Train the network of a medium, for each channel of materials or of the coefficients that are given."""
     need_torch()
@@ -65,11 +72,11 @@ def train_material(
     from halfspace_sss.neural.training.train_material import FAST, STANDARD
 
     media = stated.media(material or [], channel)
-    recipe = _of_steps(FAST if fast else STANDARD, steps)
+    recipe = _of_steps(FAST if wanted.fast else STANDARD, wanted.steps)
     rows: dict[str, list[Any]] = {}
     with places.executor() as executor, shared.Bar("training") as bar:
         results = results.elsewhere() if executor else results
-        how = {"model": model, "recipe": recipe, "backend": backend, "seed": results.seed}
+        how = {"model": wanted.model, "recipe": recipe, "backend": wanted.backend, "seed": results.seed}
         how |= {"target_error": results.target_error, "folder": results.out}
         parts = {name: (name, medium, how, results.work, None if executor else bar) for name, medium in media.items()}
         for name, result in completed(executor, _train, parts):
