@@ -58,14 +58,29 @@ def test_images_agree_with_the_heterogeneous_medium_of_mitsuba(surface: dict, sh
     assert np.abs(_z(_runs(mi.load_dict(scene), 12, 64, 1), _runs(theirs, 12, 64, 1001))).max() < WIDEST_Z
 
 
-@pytest.mark.parametrize("orders", ["multiple", "single"])
-def test_a_grid_that_is_the_same_everywhere_is_a_homogeneous_medium(orders: str) -> None:
-    """Joins bring the multiple scattering, and the guide the single one; light found by chance is held above."""
+@pytest.mark.parametrize(("light", "orders"), [("lamp", "total"), ("small", "multiple"), ("small", "single")])
+def test_a_grid_that_is_the_same_everywhere_is_a_homogeneous_medium(light: str, orders: str) -> None:
+    """Under the small lamp joins bring the multiple scattering, and the guide the single one."""
+    lamp = _lamp() if light == "lamp" else _small_lamp()
     spread = np.ones((2, 3, 4, 3))
     grids = {"sigma_t": _grid([0.51, 1.1, 2.5] * spread), "albedo": _grid([0.98, 0.9, 0.8] * spread)}
     same = {"sigma_t": "0.51,1.1,2.5", "albedo": "0.98,0.9,0.8"}
     a, b = (
-        _runs(mi.load_dict(_scene({**medium, "g": 0.5, "eta": 1.4, "orders": orders}, _small_lamp())), 12, 64, seed)
+        _runs(mi.load_dict(_scene({**medium, "g": 0.5, "eta": 1.4, "orders": orders}, lamp)), 12, 64, seed)
+        for medium, seed in ((grids, 1), (same, 100))
+    )
+    assert np.abs(_z(a, b)).max() < WIDEST_Z
+
+
+def test_null_collisions_change_nothing() -> None:
+    """A bright voxel beyond the object raises the majorant, nothing else."""
+    values = np.ones((1, 1, 8, 3)) * [0.51, 1.1, 2.5]
+    values[..., -1, :] = [5.0, 2.0, 40.0]
+    wide = mi.ScalarTransform4f().translate([-10, -10, -10]).scale([80, 20, 20])  # the object is in the first quarter
+    grids = {"sigma_t": _grid(values, wide), "albedo": "0.98,0.9,0.8"}
+    same = {"sigma_t": "0.51,1.1,2.5", "albedo": "0.98,0.9,0.8"}
+    a, b = (
+        _runs(mi.load_dict(_scene({**medium, "g": 0.5, "eta": 1.4}, _lamp())), 12, 64, seed)
         for medium, seed in ((grids, 1), (same, 100))
     )
     assert np.abs(_z(a, b)).max() < WIDEST_Z
