@@ -19,7 +19,7 @@ import numpy as np
 from halfspace_sss.comparison.cell_energies import evaluated
 from halfspace_sss.comparison.truths import Truth, read_truths
 from halfspace_sss.interface.model import BSSRDF
-from halfspace_sss.measure import DIFFUSE_COSINES, reflectance_estimate
+from halfspace_sss.measure.reflected_flux import DIFFUSE_COSINES, reflectance_estimate
 from halfspace_sss.physics.fresnel import F_r
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.registry import bssrdf, models
