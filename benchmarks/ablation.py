@@ -19,7 +19,7 @@ from benchmarks.budgets import Budget, Samples, Seconds, Within
 from halfspace_sss.arrays import library
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count
-from halfspace_sss.comparison.model_errors import TracedMaps, model_error, reference_maps
+from halfspace_sss.comparison.model_errors import ReferenceSize, TracedMaps, model_error, reference_maps
 from halfspace_sss.executors import completed
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.interface.query import Query
@@ -296,7 +296,8 @@ def _data(of: _Maps) -> tuple[MapPool, TracedMaps]:
     groups = draw_directions(*ratios, np.random.default_rng([seed, 0]))
     halves = make_pool(groups, recipe.grid, recipe.events, (seed, 1), None, None, of.backend)
     check = (VALIDATION_SEED, seed)
-    result = reference_maps([medium], SETS, recipe.grid, BLOCK, recipe.events / 4, check, None, of.backend)
+    size = ReferenceSize(SETS, recipe.grid, BLOCK)
+    result = reference_maps([medium], size, recipe.events / 4, check, backend=of.backend)
     return MapPool(groups, recipe.grid, halves), result[0]
 
 

@@ -167,7 +167,16 @@ def flow_walks(
     back = direction_square(at.n_out, out.p - at.p, at.w)
     u = _rows([*chart.coordinates(face, at.p), *back], m)
     entry = _rows(side_features(frame, Side(at, first_event(obj, at))), m)
-    return Walks(starts_rows[k], told, entry, u, np.array(patch).astype(np.int64), total[k], starts_rows, total)
+    return Walks(
+        exit=starts_rows[k],
+        told=told,
+        entry=entry,
+        u=u,
+        patch=np.array(patch).astype(np.int64),
+        T=total[k],
+        starts=starts_rows,
+        total=total,
+    )
 
 
 def _rows(columns: list[Any], n: int) -> np.ndarray:

@@ -56,10 +56,9 @@ def inversion_command(
 
     from benchmarks import inversion, inversion_gradients, inversion_textures
 
+    how = {"target_spp": target_spp, "steps": steps, "prb_steps": prb_steps, "seed": seed}
     media = {
-        f"{case}, target {k}": partial(
-            inversion.medium_rows, case, k, size, spp, target_spp, steps, prb_steps, seed
-        )
+        f"{case}, target {k}": partial(inversion.medium_rows, case, k, size, spp, **how)
         for case in inversion.CASES
         for k in range(targets)
     }  # fmt: skip

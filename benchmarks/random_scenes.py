@@ -64,9 +64,10 @@ def random_scene(number: int, seed: int = 0, tolerance: float | None = None) -> 
     view = rng.standard_normal(3) * (1, 0.4, 1) + (0, 0.5, 0)
     drawn = float(f"{10 ** rng.uniform(np.log10(0.03), np.log10(0.3)):.3g}")
     return RandomScene(
-        seed, number, str(rng.choice(SHAPES)), str(rng.choice(LIGHTS)), _digits(sigma_t), _digits(albedo),
-        float(rng.choice([0.0, 0.0, 0.5, 0.8])), float(rng.choice([1.0, 1.3, 1.3, 1.5])), round(mfp, 3),
-        _digits(view / np.linalg.norm(view)), drawn if tolerance is None else tolerance, int(rng.choice([1, 10, 100])),
+        seed=seed, number=number, shape=str(rng.choice(SHAPES)), light=str(rng.choice(LIGHTS)),
+        sigma_t=_digits(sigma_t), albedo=_digits(albedo), g=float(rng.choice([0.0, 0.0, 0.5, 0.8])),
+        eta=float(rng.choice([1.0, 1.3, 1.3, 1.5])), mfp=round(mfp, 3), view=_digits(view / np.linalg.norm(view)),
+        tolerance=drawn if tolerance is None else tolerance, images=int(rng.choice([1, 10, 100])),
     )  # fmt: skip
 
 

@@ -82,7 +82,9 @@ def speeds_command(
     check_interval("seconds", seconds, 0.1, 1e6)
     cases = [LitObject(name, each) for name in names for each in lights]
     check_folder(out)
-    how = Measuring(models, kinds, size, passes, over, frames, seconds, seed)
+    how = Measuring(
+        models=models, kinds=kinds, size=size, passes=passes, over=over, frames=frames, seconds=seconds, seed=seed
+    )
     with Bar("speeds") as bar:
         table = speeds(cases, how, out / "work", lambda what, k, n: bar.show(k, n, what))
     text = "\n".join(markdown(part) for part in tables(table))

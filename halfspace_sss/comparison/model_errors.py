@@ -205,29 +205,38 @@ def _mean_of_both_ways(groups: Groups, halves: np.ndarray) -> np.ndarray:
     return (0.5 * (sets + rolled)).reshape(halves.shape)
 
 
+class ReferenceSize(NamedTuple):
+    """Sets of 8 directions, the cells of their maps, and cells of u and of psi that are compared together."""
+
+    n_sets: int
+    grid: CellGrid
+    block: int
+
+
 def reference_maps(
     media: list[Medium],
-    n_sets: int,
-    grid: CellGrid,
-    block: int,
+    size: ReferenceSize,
     events: float,
     seed: tuple[int, ...],
     progress: NamedProgress | None = None,
     backend: str = "llvm",
     executor: Executor | None = None,
 ) -> list[TracedMaps]:
-    """Traced maps of scalar media, each with `n_sets` times 8 directions of incidence times 16 of observation.
+    """Traced maps of scalar media, each with n_sets times 8 directions of incidence times 16 of observation.
 
     Args:
         media: scalar media; lengths are mean free paths of each.
+        size: sets of directions, cells and blocks.
         events: scattering events over all media.
         seed: must differ from that of any training.
         executor: where launches run (see `halfspace_sss.executors`); by default in this process.
     """
-    rng = np.random.default_rng(list(seed))
+    rng, (n_sets, grid, block) = np.random.default_rng(list(seed)), size
     parts = [_reciprocal_directions(m, n_sets, grid.n_psi, rng) for m in media]
     columns = (np.concatenate([getattr(p, n) for p in parts]) for n in Groups.__dataclass_fields__)
-    halves = make_pool(Groups(*columns), grid, events, (*seed, 1), None, progress, backend, executor)
+    halves = make_pool(
+        Groups(*columns), grid, events, (*seed, 1), folder=None, progress=progress, backend=backend, executor=executor
+    )
     n = n_sets * SET
     maps = [_mean_of_both_ways(p, halves[k * n : (k + 1) * n]) for k, p in enumerate(parts)]
     return [TracedMaps(m.in_mfp(), p, grid, h, block) for m, p, h in zip(media, parts, maps)]
@@ -261,7 +270,8 @@ def references(
     progress: NamedProgress | None = None, backend: str = "llvm", executor: Executor | None = None,
 ) -> list[TracedMaps]:  # fmt: skip
     """Traced maps of the media: 128 unseen pairs of directions each, `events` over all."""
-    return reference_maps(media, 1, GRID, block, events, (HELD_OUT_SEED, seed), progress, backend, executor)
+    size = ReferenceSize(1, GRID, block)
+    return reference_maps(media, size, events, (HELD_OUT_SEED, seed), progress, backend, executor)
 
 
 def error_table(

@@ -166,8 +166,9 @@ def curves(
         speeds[model.name] = _evaluations_per_s(model, line)
         steps.advance()
     return CurveSet(
-        title, medium, float(theta_o_deg), float(delta_phi_deg), float(line_deg), half_width, orders, line.r_edges,
-        tuple(results), speeds, walks, seed, backend, seconds, notes,
+        title=title, medium=medium, theta_o_deg=float(theta_o_deg), delta_phi_deg=float(delta_phi_deg),
+        line_deg=float(line_deg), half_width=half_width, orders=orders, r_edges=line.r_edges, curves=tuple(results),
+        evaluations_per_s=speeds, n_paths=walks, seed=seed, backend=backend, seconds=seconds, notes=notes,
     )  # fmt: skip
 
 

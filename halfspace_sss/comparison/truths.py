@@ -136,8 +136,8 @@ def _truth(row: dict[str, str]) -> Truth:
             raise ValueError(f"other must hold a ring [a,b] cm, got {row['other']!r}")
         ring, factor = tuple(round(10 * float(v), 9) for v in match.groups()), PER_CM2
     return Truth(
-        row["id"], row["kind"], row["quantity"], row["source"], measure, medium, mu_i, direction, ring, factor,
-        _number(row, "value"), _uncertainty(row),
+        **{name: row[name] for name in ("id", "kind", "quantity", "source")}, measure=measure, medium=medium, mu_i=mu_i,
+        direction=direction, ring=ring, factor=factor, value=_number(row, "value"), uncertainty=_uncertainty(row),
     )  # fmt: skip
 
 

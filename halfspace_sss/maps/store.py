@@ -120,6 +120,7 @@ def _check_chunk(chunk: Path, size: int) -> None:
 FORMAT = 1
 MOST_PATHS = 2**33
 DATA = ("S", "variance")
+Unit = tuple[str, int, MapUnit]  # name of the medium, channel, and what is traced
 
 
 def make_maps(
@@ -171,15 +172,16 @@ def make_maps(
             locks.enter_context(one_writer(path, shared=share[1] > 1))
             if share[1] > 1:
                 locks.enter_context(one_writer(path.with_name(f"{path.name}.{share[0]}-of-{share[1]}")))
-        _fill(media, paths, asked, units, grid, seed, progress, executor)
+        _create_missing(media, paths, asked, units, grid, seed)
+        _trace_missing(paths, asked, units, progress, executor)
     return paths
 
 
-def _fill(
-    media: Mapping[str, Medium], paths: dict[str, Path], asked: dict[str, dict], units: list[tuple[str, int, MapUnit]],
-    grid: MapGrid, seed: int, progress: ProgressText | None, executor: Executor | None,
+def _create_missing(
+    media: Mapping[str, Medium], paths: dict[str, Path], asked: dict[str, dict], units: list[Unit], grid: MapGrid,
+    seed: int,
 ) -> None:  # fmt: skip
-    """Make the stores that are not there, and trace the units that are not whole."""
+    """Make the stores that are not there, once those that are there are known to be of the same parameters."""
     for name in media:
         if _exists(paths[name]):
             drop_cut_off(paths[name], {(channel, u.theta_index) for of, channel, u in units if of == name})
@@ -187,13 +189,24 @@ def _fill(
     for name, medium in media.items():
         if not _exists(paths[name]):
             _create(paths[name], medium, grid, seed, asked[name])
+
+
+def _trace_missing(
+    paths: dict[str, Path], asked: dict[str, dict], units: list[Unit], progress: ProgressText | None,
+    executor: Executor | None,
+) -> None:  # fmt: skip
+    """Trace the units that are not whole."""
     stores = {name: _open_same(path, asked[name]) for name, path in paths.items()}
     left = [u for u in units if not _done(paths[u[0]], stores[u[0]], u[1], u[2].theta_index)]
     before = len(units) - len(left)
     if progress:
         progress(before, len(units), "")
     parts = {
-        f"{name} channel {channel} direction {unit.theta_index + 1}/{grid.n_theta}": (path.absolute(), channel, unit)
+        f"{name} channel {channel} direction {unit.theta_index + 1}/{unit.grid.n_theta}": (
+            path.absolute(),
+            channel,
+            unit,
+        )
         for name, channel, unit in left
         for path in (paths[name],)
     }
@@ -204,10 +217,11 @@ def _fill(
 
 def _units(
     media: Mapping[str, Medium], grid: MapGrid, target_error: float | None, n_paths: int, seed: int, backend: str
-) -> list[tuple[str, int, MapUnit]]:
+) -> list[Unit]:
     """Name, channel and work of every unit, in the order of the shares."""
+    stop = {"target_error": target_error, "n_paths": n_paths, "backend": backend}
     return [
-        (name, channel, MapUnit(mfp, grid, a, seed, channel, target_error, n_paths, backend))
+        (name, channel, MapUnit(mfp, grid, a, seed, stream=channel, **stop))
         for name, medium in media.items()
         for channel in range(medium.n_channels or 1)
         for mfp in (medium.channel(channel).in_mfp(),)

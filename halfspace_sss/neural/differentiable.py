@@ -29,12 +29,13 @@ def neural_S(sigma_t: Any, albedo: Any, g: Any, eta: Any, r: Any, mu_i: Any, phi
     Raises:
         ValueError: the arrays are of another library, or of several.
     """
-    lib = library(sigma_t, albedo, g, eta, r, mu_i, phi_i, mu_o, phi_o)
+    medium, query = (sigma_t, albedo, g, eta), (r, mu_i, phi_i, mu_o, phi_o)
+    lib = library(*medium, *query)
     if lib is library(0.0):
         raise ValueError(
             "sigma_t must be a torch tensor or Dr.Jit array, got numbers; use bssrdf('neural', medium).eval"
         )
-    _, (r, mu_i, phi_i, mu_o, phi_o) = broadcast_query(r, mu_i, phi_i, mu_o, phi_o)
+    _, (r, mu_i, phi_i, mu_o, phi_o) = broadcast_query(*query)
     hyper = load_hypernetwork(shipped_weights())
     L = length_scale(albedo, g)
     c = medium_features(lib, albedo, g, eta, L)

@@ -151,7 +151,9 @@ def _basis(eta: float) -> _Basis:
     root, mean = np.sqrt(w)[:, None], w @ P[:, 2::2]
     turn = np.linalg.qr(np.column_stack([root, np.eye(len(mu))[:, 1:]]))[0]
     even, others = root * (P[:, 2::2] - mean), turn[:, 1:]
-    return _Basis(mu, w, even, root * P[:, 1::2], mean, turn[:, 0], others, others.T @ even)
+    return _Basis(
+        mu=mu, w=w, even=even, odd=root * P[:, 1::2], mean=mean, alike=turn[:, 0], others=others, turned=others.T @ even
+    )
 
 
 def _nodes(n: int, eta: float) -> tuple[np.ndarray, np.ndarray]:

@@ -133,11 +133,10 @@ def trace_layers(
         check_interval("relative_error", relative_error, 1e-6, 1)
     edges = checked_radii(radii, mu_i)
     types, started = array_types(backend), time.perf_counter()
+    beam = types, layers, mu_i, n_paths, (seed,)
     walk = functools.partial(_walk, diffuse=mu_i == "diffuse")
     samples, rings, events, paths = [], [], 0, 0
-    for done in walk_passes(
-        types, layers, mu_i, n_paths, (seed,), lambda: [_Tally(types, layers, edges)], progress, walk
-    ):
+    for done in walk_passes(*beam, lambda: [_Tally(types, layers, edges)], progress, walk):
         (tally,) = done.tallies
         scale = BATCHES / done.n_paths * (1.0 if mu_i == "diffuse" else done.T_i[0])
         samples.append(scale * tally.cells.result())
@@ -150,9 +149,10 @@ def trace_layers(
     n, result = len(layers), np.concatenate(samples)
     areas = None if edges is None else np.pi * np.diff(edges**2)
     return LayerTrace(
-        layers, mu_i, seed, backend, paths, events, time.perf_counter() - started,
-        result[:, : 3 * n].reshape(-1, n, 3), result[:, 3 * n : 3 * n + 3], result[:, 3 * n + 3 :],
-        None if edges is None else np.concatenate(rings) / areas,
+        layers=layers, mu_i=mu_i, seed=seed, backend=backend, n_paths=paths, n_events=events,
+        seconds=time.perf_counter() - started, _reflected=result[:, : 3 * n].reshape(-1, n, 3),
+        _transmitted=result[:, 3 * n : 3 * n + 3], _absorbed=result[:, 3 * n + 3 :],
+        _rings=None if edges is None else np.concatenate(rings) / areas,
     )  # fmt: skip
 
 

@@ -169,8 +169,9 @@ def trace(
             break
     exitance = None if edges is None else np.concatenate(rings) / (np.pi * np.diff(edges**2))
     return Trace(
-        medium, mu_i, seed, backend, paths, events, time.perf_counter() - started, np.concatenate(rows), exitance,
-        0 if pairs is None else len(pairs), None if pairs is None else F_t(pairs[:, 0], medium.eta),
+        medium=medium, mu_i=mu_i, seed=seed, backend=backend, n_paths=paths, n_events=events,
+        seconds=time.perf_counter() - started, _lanes=np.concatenate(rows), _rings=exitance,
+        _n_directions=0 if pairs is None else len(pairs), _T_o=None if pairs is None else F_t(pairs[:, 0], medium.eta),
     )  # fmt: skip
 
 

@@ -295,7 +295,10 @@ def _step(s: dict, sums: tuple, m: WalkConstants, start: tuple, lane: Any, talli
     x, y, z, dz = x + dx * path, y + dy * path, dr.abs(below), dr.select(crosses, -dz, dz)
     weight = dr.select(crosses, s["weight"] * F, s["weight"]) * m.albedo
     order = s["order"] + 1
-    event = Scatter(order, weight, x, y, z, dx, dy, dz, lane, s["first"], rng.next_float32)
+    event = Scatter(
+        order=order, weight=weight, x=x, y=y, z=z, dx=dx, dy=dy, dz=dz, lane=lane, first=s["first"],
+        random=rng.next_float32,
+    )  # fmt: skip
     sums = tuple(tally.scatter(state, event) for tally, state in zip(tallies, sums))
 
     u, azimuth = rng.next_float32(), 2 * math.pi * rng.next_float32()

@@ -31,7 +31,7 @@ from benchmarks.ablation import (
 from benchmarks.budgets import Samples, Seconds, Within
 from halfspace_sss import Medium, materials
 from halfspace_sss.arrays import library
-from halfspace_sss.comparison.model_errors import TracedMaps, model_error, reference_maps
+from halfspace_sss.comparison.model_errors import ReferenceSize, TracedMaps, model_error, reference_maps
 from halfspace_sss.kept_rows import KeptRows
 from halfspace_sss.maps import noisy_maps
 from halfspace_sss.maps.noisy_maps import CellGrid, draw_directions, make_pool
@@ -64,7 +64,7 @@ def pool() -> MapPool:
 
 @pytest.fixture(scope="module")
 def reference() -> TracedMaps:
-    return reference_maps([FIG10], 1, GRID, 2, 1e6, (2,))[0]
+    return reference_maps([FIG10], ReferenceSize(1, GRID, 2), 1e6, (2,))[0]
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ import pytest
 
 from halfspace_sss import Medium, trace
 from halfspace_sss.comparison import model_errors as errors
-from halfspace_sss.comparison.model_errors import TracedMaps, model_error, reference_maps
+from halfspace_sss.comparison.model_errors import ReferenceSize, TracedMaps, model_error, reference_maps
 from halfspace_sss.maps.noisy_maps import (
     CellGrid,
     Groups,
@@ -160,7 +160,7 @@ def test_what_is_left_of_the_error_of_the_truth_falls_with_the_events(monkeypatc
     """From 1.6e5 to 4e6 events noise falls fivefold, and with it what is left."""
     left = []
     for events in (1.6e5, 4e6):
-        (found,) = reference_maps([MEDIA[1]], 1, GRID, 4, events, (7,))
+        (found,) = reference_maps([MEDIA[1]], ReferenceSize(1, GRID, 4), events, (7,))
         again = errors._mean_of_both_ways(found.groups, make_pool(found.groups, GRID, 12 * events, (8,)))
         truth = dataclasses.replace(found, halves=again).energies().mean(axis=1)
         left.append(model_error(_answer(monkeypatch, truth), found))

@@ -7,7 +7,7 @@ import pytest
 
 import halfspace_sss
 from halfspace_sss import Medium
-from halfspace_sss.comparison.model_errors import model_error, reference_maps
+from halfspace_sss.comparison.model_errors import ReferenceSize, model_error, reference_maps
 from halfspace_sss.comparison.model_truths import sampled_reflectance
 from halfspace_sss.maps.noisy_maps import CellGrid
 from halfspace_sss.neural.differentiable import neural_S
@@ -42,7 +42,7 @@ def test_the_shipped_weights_are_small():
     "medium", [FIG10, Medium.from_albedo(0.99, 1.0, 0.5, 1.5), Medium.from_albedo(0.3, 1.0, 0.0, 1.0)]
 )
 def test_unseen_maps_are_met_better_than_by_any_dipole(medium):
-    (reference,) = reference_maps([medium], 1, CellGrid(40, 16), 4, 5e6, (31,))
+    (reference,) = reference_maps([medium], ReferenceSize(1, CellGrid(40, 16), 4), 5e6, (31,))
     error = model_error(halfspace_sss.bssrdf("neural", medium), reference).error
     dipoles = ("standard_dipole", "better_dipole", "photon_beam_diffusion", "normalized_diffusion")
     others = [model_error(halfspace_sss.bssrdf(name, medium), reference).error for name in dipoles]

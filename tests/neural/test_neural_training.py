@@ -16,7 +16,7 @@ import torch
 
 import halfspace_sss
 from halfspace_sss import Medium, materials
-from halfspace_sss.comparison.model_errors import TracedMaps, model_error, reference_maps
+from halfspace_sss.comparison.model_errors import ReferenceSize, TracedMaps, model_error, reference_maps
 from halfspace_sss.maps.grid import draw_media
 from halfspace_sss.maps.noisy_maps import CellGrid, draw_directions, make_pool
 from halfspace_sss.neural.hypernetwork import Hypernetwork
@@ -74,7 +74,7 @@ def pool() -> MapPool:
 
 @pytest.fixture(scope="module")
 def reference() -> TracedMaps:
-    return reference_maps([FIG10], 1, GRID, 2, 1e6, (2,))[0]
+    return reference_maps([FIG10], ReferenceSize(1, GRID, 2), 1e6, (2,))[0]
 
 
 def _batches(pool: MapPool) -> Source:

@@ -115,8 +115,8 @@ class MapPool:
         L = self.L[j]
         r = L * unwarp(torch_library(), u)
         return Batch(
-            y, self.hit[row, i], u, r, psi, self.mu_i[j], self.mu_o[row, twice], self.delta_phi[row, twice], L, j,
-            self.medium[j],
+            y=y, hit=self.hit[row, i], u=u, r=r, psi=psi, mu_i=self.mu_i[j], mu_o=self.mu_o[row, twice],
+            delta_phi=self.delta_phi[row, twice], L=L, index=j, medium=self.medium[j],
         )  # fmt: skip
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_choice, check_count, check_interval
-from halfspace_sss.comparison.model_errors import ModelError, model_error, reference_maps
+from halfspace_sss.comparison.model_errors import ModelError, ReferenceSize, model_error, reference_maps
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.maps.noisy_maps import CellGrid, Groups, draw_directions, make_pool
 from halfspace_sss.neural import material_model, paper_model
@@ -129,7 +129,8 @@ def train_channel(
     pool = MapPool(groups, recipe.grid, halves)
     check = (VALIDATION_SEED, seed)
     events = recipe.validation_share * recipe.events
-    (reference,) = reference_maps([medium], VALIDATION_SETS, recipe.grid, BLOCK, events, check, None, backend)
+    size = ReferenceSize(VALIDATION_SETS, recipe.grid, BLOCK)
+    (reference,) = reference_maps([medium], size, events, check, backend=backend)
     data_seconds = time.monotonic() - started
     learner = training.learner(medium, pool, seed)
     results: list[ModelError] = []  # the last of them is that of the end, unless the run was over when it was resumed
