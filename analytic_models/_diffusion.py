@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from halfspace_sss.arrays import Library, Real
 from halfspace_sss.checks import check_choice
 from halfspace_sss.physics import fresnel
 from halfspace_sss.physics.medium import Medium
@@ -62,7 +62,7 @@ class Grosjean:
         self.z_b = 2 * boundary.A * self.D
 
 
-def safe_differences(lib: Any, a: Any, d_r: Any, d_v: Any, delta: Any) -> tuple[Any, Any, Any]:
+def safe_differences(lib: Library, a: Real, d_r: Real, d_v: Real, delta: Real) -> tuple[Real, Real, Real]:
     """Differences between a real and a virtual source at distances d_r and d_v = d_r + delta, over exp(-a d_r).
 
     Returns exp(-a delta), 1/d_r - exp(-a delta)/d_v and the same of (1 + a d) exp(-a d)/d³; each is a sum of terms

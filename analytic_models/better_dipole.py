@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 from analytic_models._diffusion import DiffuseBoundary, Grosjean, safe_differences
+from halfspace_sss.arrays import Real
 from halfspace_sss.interface.model import Separable
 from halfspace_sss.interface.query import Query
 from halfspace_sss.physics.medium import Medium
@@ -41,7 +41,7 @@ class BetterDipole(Separable):
     def N(self) -> float:
         return self._boundary.N
 
-    def R_d(self, q: Query) -> Any:
+    def R_d(self, q: Query) -> Real:
         lib, c = q.lib, self._c
         sigma_tr, z_r, z_b, D = (q.constant(v) for v in (c.sigma_tr, 1 / c.sigma_t_prime, c.z_b, c.D))
         z_v = z_r + 2 * z_b

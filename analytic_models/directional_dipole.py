@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
 from analytic_models._diffusion import DiffuseBoundary, safe_differences
+from halfspace_sss.arrays import Real
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.interface.query import Query
 from halfspace_sss.physics.medium import Medium
@@ -57,10 +57,10 @@ class DirectionalDipole(BSSRDF):
         self._boundary = DiffuseBoundary.of(medium.eta, moments)
         self._c = _Coefficients(medium, self._boundary)
 
-    def G(self, q: Query) -> Any:
+    def G(self, q: Query) -> Real:
         return q.lib.maximum(self.G_unclamped(q), 0.0)
 
-    def G_unclamped(self, q: Query) -> Any:
+    def G_unclamped(self, q: Query) -> Real:
         q = q.in_float64()
         lib, c = q.lib, self._c
         C_phi, C_E = q.constant(self._boundary.C_phi), q.constant(self._boundary.C_E)

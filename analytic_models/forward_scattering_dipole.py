@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from analytic_models._diffusion import unit_gauss
+from halfspace_sss.arrays import Library, Real
 from halfspace_sss.checks import check_choice
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.interface.query import Query
@@ -19,7 +19,7 @@ R_MIN, MU_MIN = 1e-6, 1e-3  # mean free paths; refracted cosine
 VIRTUAL_SOURCES = ("classical", "grosjean", "directional")
 
 
-def _power_series(coefficients: list[float], x: Any) -> Any:
+def _power_series(coefficients: list[float], x: Real) -> Real:
     total = coefficients[-1] + 0 * x
     for c in reversed(coefficients[:-1]):
         total = c + x * total
@@ -40,14 +40,14 @@ class Monopole:
     E²/F - 2 D; hence E/F = tanh(tau). A and B cancel for small tau: series there.
     """
 
-    D: Any
-    E: Any
-    F: Any
-    Z: Any
-    tanh: Any
+    D: Real
+    E: Real
+    F: Real
+    Z: Real
+    tanh: Real
 
     @staticmethod
-    def at(lib: Any, tau: Any) -> Monopole:
+    def at(lib: Library, tau: Real) -> Monopole:
         t, one_minus_t = lib.exp(-2 * tau), -lib.expm1(-2 * tau)
         near = lib.minimum(tau, 0.5)
         square, cube = near * near, near * near * near
@@ -58,12 +58,12 @@ class Monopole:
         D = 0.75 * B / (one_minus_t * A)
         return Monopole(D, 1.5 * one_minus_t / A, 1.5 * (1 + t) / A, Z, one_minus_t / (1 + t))
 
-    def scale(self, lib: Any) -> Any:
+    def scale(self, lib: Library) -> Real:
         """F^(3/2) Z/(1 - e^-Z); its lost factor e^-Z belongs to `exponent`."""
         Z = lib.maximum(self.Z, 1e-30)
         return self.F * lib.sqrt(self.F) * Z / -lib.expm1(-Z)
 
-    def exponent(self, r: Any, along: Any, across2: Any) -> Any:
+    def exponent(self, r: Real, along: Real, across2: Real) -> Real:
         """-Z - D (1 + u_0.u_L) + E R.(u_0 + u_L) - F R² as three terms <= 0, nothing cancels.
 
         along and across2: component of u_0 + u_L along R, and the square of the rest. As 2 (1 + u_0.u_L) is the square
@@ -72,7 +72,7 @@ class Monopole:
         miss = r - 0.5 * along * self.tanh
         return -self.Z * (1 - 0.5 * along) * (1 + 0.5 * along) - 0.5 * self.D * across2 - self.F * miss * miss
 
-    def virtual_deficit(self, mu_i: Any, mu_o: Any, z_v: Any) -> Any:
+    def virtual_deficit(self, mu_i: Real, mu_o: Real, z_v: Real) -> Real:
         """Exponent of the real source minus that of the virtual one, z_v over it and mirrored; never negative."""
         return 2 * self.D * mu_i * mu_o + z_v * (self.E * (mu_i + mu_o) + self.F * z_v)
 
@@ -132,7 +132,7 @@ class ForwardScatteringDipole(BSSRDF):
         if self.radiance_scaling:
             self._scale = self._scale / m.eta**2
 
-    def G(self, q: Query) -> Any:
+    def G(self, q: Query) -> Real:
         q = q.in_float64()
         lib, integrand = q.lib, _Integrand(q, *(q.constant(v) for v in (self._p, self._absorption, self._z_v)))
         start, end = integrand.bounds()
@@ -142,7 +142,7 @@ class ForwardScatteringDipole(BSSRDF):
             ratio = lib.maximum(length, 0.0) / width
             span = lib.log(ratio + lib.sqrt(ratio * ratio + 1))  # asinh: x = peak + width sinh(span y)
 
-            def add(total: Any, y: Any, weight: Any, span: Any = span, sign: float = sign) -> tuple:
+            def add(total: Real, y: Real, weight: Real, span: Real = span, sign: float = sign) -> tuple:
                 e = lib.exp(span * y)
                 jacobian = 0.5 * (e + 1 / e) * span * width
                 return (total + weight * jacobian * integrand.value(peak + sign * width * 0.5 * (e - 1 / e)),)
@@ -154,7 +154,7 @@ class ForwardScatteringDipole(BSSRDF):
 class _Integrand:
     """[G - G_v] s as a function of x = ln(p s), for one query."""
 
-    def __init__(self, q: Query, p: Any, absorption: Any, z_v: Any) -> None:
+    def __init__(self, q: Query, p: Real, absorption: Real, z_v: Real) -> None:
         self.lib, self.absorption, self.z_v = q.lib, absorption, z_v
         lib = q.lib
         self.r = p * lib.maximum(q.r, R_MIN)
@@ -164,22 +164,22 @@ class _Integrand:
         side = sin_o * lib.sin(q.phi_o) - sin_i * lib.sin(q.phi_i)
         self.across2 = side * side + (self.mu_o - self.mu_i) * (self.mu_o - self.mu_i)
 
-    def _parts(self, x: Any) -> tuple[Any, Any]:
+    def _parts(self, x: Real) -> tuple[Real, Real]:
         lib = self.lib
         tau = lib.exp(x)
         m = Monopole.at(lib, tau)
         scale = m.scale(lib) * tau * -lib.expm1(-m.virtual_deficit(self.mu_i, self.mu_o, self.z_v))
         return scale, m.exponent(self.r, self.along, self.across2) - self.absorption * tau
 
-    def value(self, x: Any) -> Any:
+    def value(self, x: Real) -> Real:
         scale, exponent = self._parts(x)
         return scale * self.lib.exp(exponent)
 
-    def log(self, x: Any) -> Any:
+    def log(self, x: Real) -> Real:
         scale, exponent = self._parts(x)
         return self.lib.log(self.lib.maximum(scale, 1e-300)) + exponent
 
-    def bounds(self) -> tuple[Any, Any]:
+    def bounds(self) -> tuple[Real, Real]:
         """Range of x outside which the integrand is under e^-40 of its peak, or its power-law tail under 1e-7."""
         lib, r = self.lib, self.r
         # below 4e-3 (1 - along²/4) the exponent is under -700
@@ -192,11 +192,11 @@ class _Integrand:
         end = lib.maximum(lib.minimum(absorbed, free), 2 * start)
         return lib.log(start), lib.log(end)
 
-    def peak(self, start: Any, end: Any) -> tuple[Any, Any]:
+    def peak(self, start: Real, end: Real) -> tuple[Real, Real]:
         """Where the integrand is largest, and over what width in x it falls by a factor e."""
         lib = self.lib
 
-        def scan(best: Any, where: Any, y: Any) -> tuple:
+        def scan(best: Real, where: Real, y: Real) -> tuple:
             x = low + y * (high - low)
             log = self.log(x)
             return lib.maximum(best, log), lib.where(log > best, x, where)

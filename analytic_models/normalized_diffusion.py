@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import Any
 
 import numpy as np
 
 from analytic_models._diffusion import unit_gauss
+from halfspace_sss.arrays import Real
 from halfspace_sss.interface.model import Separable, exit_normaliser
 from halfspace_sss.interface.query import Query
 from halfspace_sss.physics.fresnel import C_1
@@ -76,7 +76,7 @@ class NormalizedDiffusion(Separable):
     def N(self) -> float:
         return exit_normaliser(self.medium.eta)
 
-    def R_d(self, q: Query) -> Any:
+    def R_d(self, q: Query) -> Real:
         lib, A, d = q.lib, q.constant(self.A), q.constant(self.d)
         r = lib.maximum(q.r, R_MIN)
         third = lib.exp(-r / (3 * d))

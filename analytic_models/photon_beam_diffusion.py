@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 from analytic_models._diffusion import DiffuseBoundary, Grosjean, safe_differences, unit_gauss
+from halfspace_sss.arrays import Real
 from halfspace_sss.checks import check_choice
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.interface.query import Query
@@ -55,11 +55,11 @@ class PhotonBeamDiffusion(BSSRDF):
         self._kappa_rate = 2 * (self._c.sigma_t_prime if kappa == "reduced" else 1 + 0 * self._c.sigma_t_prime)
 
     @property
-    def strength(self) -> Any:
+    def strength(self) -> Real:
         """Factor of the integral that does not vary along the beam, albedo'² sigma_t' / (4 pi), in 1/mfp."""
         return self._c.albedo_prime**2 * self._c.sigma_t_prime / (4 * math.pi)
 
-    def exitance(self, q: Query, t: Any, mu: Any, d_r: Any) -> Any:
+    def exitance(self, q: Query, t: Real, mu: Real, d_r: Real) -> Real:
         """Integrand of R_ms times d_r over `strength`, for the source at t (mfp) along a beam of cosine mu inside."""
         lib, c = q.lib, self._c
         sigma_tr, sigma_t_prime, z_b, D = (q.constant(v) for v in (c.sigma_tr, c.sigma_t_prime, c.z_b, c.D))
@@ -78,7 +78,7 @@ class PhotonBeamDiffusion(BSSRDF):
             exitance = -lib.expm1(-q.constant(self._kappa_rate) * (d_r + t)) * exitance
         return exitance
 
-    def G(self, q: Query) -> Any:
+    def G(self, q: Query) -> Real:
         lib, c = q.lib, self._c
         sigma_tr, sigma_t_prime = q.constant(c.sigma_tr), q.constant(c.sigma_t_prime)
         r, mu = lib.maximum(q.r, R_MIN), lib.maximum(q.mu_i_in, MU_MIN)
@@ -96,7 +96,7 @@ class PhotonBeamDiffusion(BSSRDF):
         ratio = end * (1 + (end - 2 * t_0) / (d_end + r)) / gap
         span = lib.where(ratio < 1e-2, ratio * (1 - 0.5 * ratio), lib.log(1 + ratio))
 
-        def add(total: Any, x: Any, weight: Any) -> tuple:
+        def add(total: Real, x: Real, weight: Real) -> tuple:
             # with e = exp(v/2), s = sinh(v/2), r - t_0 = gap: t = 2 s (r/e + gap s), d_r = r/e² + gap sinh v
             half = lib.expm1(0.5 * x * span)
             e = 1 + half

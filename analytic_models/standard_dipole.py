@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
+from halfspace_sss.arrays import Real
 from halfspace_sss.interface.model import Separable, exit_normaliser
 from halfspace_sss.interface.query import Query
 from halfspace_sss.physics.fresnel import boundary_A_jensen
@@ -23,7 +23,7 @@ class _Dipole:
         self.z_r = 1 / m.sigma_t_prime
         self.z_v = self.z_r * (1 + 4 / 3 * boundary_A_jensen(m.eta))
 
-    def R_d(self, q: Query) -> Any:
+    def R_d(self, q: Query) -> Real:
         sigma_tr, z_r, z_v = q.constant(self.sigma_tr), q.constant(self.z_r), q.constant(self.z_v)
         d_r, d_v = q.lib.sqrt(q.r * q.r + z_r * z_r), q.lib.sqrt(q.r * q.r + z_v * z_v)
         real = z_r * (1 + sigma_tr * d_r) * q.lib.exp(-sigma_tr * d_r) / (d_r * d_r * d_r)
@@ -51,7 +51,7 @@ class StandardDipole(Separable):
         super().__init__(medium)
         self._dipole = _Dipole(medium)
 
-    def R_d(self, q: Query) -> Any:
+    def R_d(self, q: Query) -> Real:
         return self._dipole.R_d(q)
 
 
@@ -70,5 +70,5 @@ class StandardDipoleNormalized(Separable):
     def N(self) -> float:
         return exit_normaliser(self.medium.eta)
 
-    def R_d(self, q: Query) -> Any:
+    def R_d(self, q: Query) -> Real:
         return self._dipole.R_d(q)

@@ -13,16 +13,23 @@ from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from halfspace_sss.backend import prepare_llvm
 from halfspace_sss.lazy import once
 
+if TYPE_CHECKING:
+    import drjit
+    import torch
 
-def _fold(f: Any, tables: tuple, state: tuple, x: Any) -> tuple:
+Lanes: TypeAlias = "drjit.ArrayBase"  # of Dr.Jit, one value a lane
+Real: TypeAlias = "float | np.ndarray | torch.Tensor | drjit.ArrayBase"  # a number, or an array of any library
+
+
+def _fold(f: Callable[..., tuple], tables: tuple, state: tuple, x: Real) -> tuple:
     """state = f(*state, *row) for each row of the equally long 1-D `tables`, in order; x tells the array type.
 
     A loop of array operations, one symbolic loop for Dr.Jit: kernels stay small however many rows there are.
@@ -41,27 +48,27 @@ class _NumpyLibrary:
     arctan2, floor = (staticmethod(f) for f in (np.arctan2, np.floor))
 
     @staticmethod
-    def float64(x: Any) -> Any:
+    def float64(x: Real) -> Real:
         return np.asarray(x, dtype=np.float64)
 
     @staticmethod
-    def like(value: Any, x: Any) -> Any:
+    def like(value: Real, x: Real) -> Real:
         return np.asarray(value, dtype=np.asarray(x).dtype)
 
     @staticmethod
-    def largest(x: Any) -> float:
+    def largest(x: Real) -> float:
         return float(np.finfo(np.asarray(x).dtype).max)
 
     @staticmethod
-    def constant(value: Any, x: Any) -> Any:
+    def constant(value: Real, x: Real) -> Real:
         return np.asarray(value, dtype=np.asarray(x).dtype) if np.ndim(value) else float(value)
 
     @staticmethod
-    def interval(edges: np.ndarray, x: Any) -> Any:
+    def interval(edges: np.ndarray, x: Real) -> Real:
         return np.searchsorted(edges, x, side="right") - 1
 
     @staticmethod
-    def take(table: np.ndarray, index: Any, x: Any) -> Any:
+    def take(table: np.ndarray, index: Real, x: Real) -> Real:
         return np.asarray(table, dtype=np.asarray(x).dtype)[index]
 
     stack = staticmethod(functools.partial(np.stack, axis=-1))
@@ -78,43 +85,43 @@ class _TorchLibrary:
         for name in ("exp", "expm1", "log", "sqrt", "sin", "cos", "abs", "where", "isfinite", "floor"):
             setattr(self, name, getattr(torch, name))
 
-    def _pair(self, a: Any, b: Any) -> tuple[Any, Any]:
+    def _pair(self, a: Real, b: Real) -> tuple[torch.Tensor, torch.Tensor]:
         like = a if isinstance(a, self.torch.Tensor) else b
         return tuple(v if isinstance(v, self.torch.Tensor) else self.like(v, like) for v in (a, b))
 
-    def minimum(self, a: Any, b: Any) -> Any:
+    def minimum(self, a: Real, b: Real) -> torch.Tensor:
         return self.torch.minimum(*self._pair(a, b))
 
-    def maximum(self, a: Any, b: Any) -> Any:
+    def maximum(self, a: Real, b: Real) -> torch.Tensor:
         return self.torch.maximum(*self._pair(a, b))
 
-    def arctan2(self, a: Any, b: Any) -> Any:
+    def arctan2(self, a: Real, b: Real) -> torch.Tensor:
         return self.torch.arctan2(*self._pair(a, b))
 
-    def float64(self, x: Any) -> Any:
+    def float64(self, x: torch.Tensor) -> torch.Tensor:
         return x.to(self.torch.float64)
 
-    def like(self, value: Any, x: Any) -> Any:
+    def like(self, value: Real, x: torch.Tensor) -> torch.Tensor:
         if isinstance(value, self.torch.Tensor):
             return value.to(device=x.device, dtype=x.dtype)
         return self.torch.as_tensor(value, dtype=x.dtype, device=x.device)
 
-    def largest(self, x: Any) -> float:
+    def largest(self, x: torch.Tensor) -> float:
         return self.torch.finfo(x.dtype).max
 
-    def constant(self, value: Any, x: Any) -> Any:
+    def constant(self, value: Real, x: torch.Tensor) -> torch.Tensor:
         return self.like(value, x) if np.ndim(value) else float(value)
 
     fold = staticmethod(_fold)
 
-    def interval(self, edges: np.ndarray, x: Any) -> Any:
+    def interval(self, edges: np.ndarray, x: torch.Tensor) -> torch.Tensor:
         edges = self.torch.as_tensor(edges, device=x.device)
         return self.torch.searchsorted(edges, x.to(edges.dtype).contiguous(), right=True) - 1
 
-    def take(self, table: np.ndarray, index: Any, x: Any) -> Any:
+    def take(self, table: np.ndarray, index: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
         return self.like(table, x)[index]
 
-    def stack(self, values: list) -> Any:
+    def stack(self, values: list) -> torch.Tensor:
         return self.torch.stack(values, dim=-1)
 
 
@@ -129,48 +136,49 @@ class _DrJitLibrary:
             setattr(self, name, getattr(dr, name))
         self.where, self.arctan2 = dr.select, dr.atan2
 
-    def expm1(self, x: Any) -> Any:
+    def expm1(self, x: Lanes) -> Lanes:
         half = 0.5 * self.dr.maximum(x, -60.0)  # sinh overflows in float32 below
         return 2 * self.dr.exp(half) * self.dr.sinh(half)
 
-    def float64(self, x: Any) -> Any:
+    def float64(self, x: Lanes) -> Lanes:
         return self.dr.float64_array_t(type(x))(x)
 
-    def like(self, value: Any, x: Any) -> Any:
+    def like(self, value: Real, x: Lanes) -> Lanes:
         return type(x)(value)
 
-    def largest(self, x: Any) -> float:
+    def largest(self, x: Lanes) -> float:
         return self.dr.largest(type(x))
 
-    def constant(self, value: Any, x: Any) -> Any:
+    def constant(self, value: Real, x: Lanes) -> Lanes:
         if np.ndim(value):
             raise ValueError("a Dr.Jit query is answered by a medium of one channel: use medium.channel(k)")
         return self.dr.opaque(type(x), float(value))  # kernels then differ in their data, and are compiled once
 
-    def interval(self, edges: np.ndarray, x: Any) -> Any:
+    def interval(self, edges: np.ndarray, x: Lanes) -> Lanes:
         dr = self.dr
         table = dr.float64_array_t(type(x))(edges)
         x = self.float64(x)
         upper = dr.binary_search(0, len(edges), lambda i: dr.gather(type(table), table, i) <= x)
         return dr.int32_array_t(type(x))(upper) - 1
 
-    def take(self, table: np.ndarray, index: Any, x: Any) -> Any:
+    def take(self, table: np.ndarray, index: Lanes, x: Lanes) -> Lanes:
         return self.dr.gather(type(x), type(x)(table), self.dr.uint32_array_t(type(x))(index))
 
-    def fold(self, f: Any, tables: tuple, state: tuple, x: Any) -> tuple:
+    def fold(self, f: Callable[..., tuple], tables: tuple, state: tuple, x: Lanes) -> tuple:
         dr, kind = self.dr, type(x)
         n, columns = len(tables[0]), [kind(table) for table in tables]
         zero = dr.uint32_array_t(kind)(0)
 
-        def body(k: Any, *state: Any) -> tuple:
+        def body(k: Lanes, *state: Lanes) -> tuple:
             return k + 1, *f(*state, *(dr.gather(kind, column, k) for column in columns))
 
         return dr.while_loop((zero, *state), lambda k, *_: k < n, body, label="fold")[1:]
 
-    def stack(self, values: list) -> Any:
+    def stack(self, values: list) -> Lanes:
         raise ValueError("a Dr.Jit query is answered by a medium of one channel: use medium.channel(k)")
 
 
+Library: TypeAlias = "_NumpyLibrary | _TorchLibrary | _DrJitLibrary"
 _NUMPY = _NumpyLibrary()
 
 
@@ -184,12 +192,12 @@ def _drjit_library() -> _DrJitLibrary:
     return _DrJitLibrary()
 
 
-def is_torch(lib: Any) -> bool:
+def is_torch(lib: Library) -> bool:
     """Whether functions of `library` are those for torch tensors."""
     return isinstance(lib, _TorchLibrary)
 
 
-def library(*args: Any) -> Any:
+def library(*args: Real) -> Library:
     """The functions for the arguments: Dr.Jit if any is a Dr.Jit array, then torch, else NumPy.
 
     Raises:
@@ -207,7 +215,7 @@ def library(*args: Any) -> Any:
     return _torch_library() if "torch" in modules else _NUMPY
 
 
-def _common_float(lib: Any, args: tuple, names: Sequence[str] = ()) -> tuple:
+def _common_float(lib: Library, args: tuple, names: Sequence[str] = ()) -> tuple:
     """Arguments as floating-point arrays of one library and the widest precision among the arrays."""
     if lib is _NUMPY:
         arrays = [np.asarray(a) for a in args]
@@ -231,7 +239,7 @@ def _common_float(lib: Any, args: tuple, names: Sequence[str] = ()) -> tuple:
     return tuple(kind(a) for a in args)
 
 
-def broadcast_query(*args: Any, names: Sequence[str] = ()) -> tuple[Any, tuple]:
+def broadcast_query(*args: Real, names: Sequence[str] = ()) -> tuple[Library, tuple]:
     """The library of a query and its arguments as broadcast floating-point arrays of that library.
 
     The precision is the widest among the array arguments; Python numbers follow it, and a query of

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from halfspace_sss.lazy import once
 
@@ -200,7 +200,7 @@ def array_types(backend: str = "llvm") -> ModuleType:
     return getattr(dr, backend)
 
 
-def kernel_seconds(make: Callable[[], Any]) -> float:
+def kernel_seconds(make: Callable[[], object]) -> float:
     """Seconds in which the kernels run that compute what `make` returns, without tracing and compiling them."""
     import drjit as dr
 

@@ -6,19 +6,18 @@ import difflib
 import math
 import numbers
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 import numpy as np
 
 ROUNDING_ULPS = 4
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> object:
     """The value as messages show it: NumPy's numbers as Python's."""
     return value.item() if isinstance(value, np.generic) else value
 
 
-def did_you_mean(value: Any, known: Iterable[str], most: int = 1) -> str:
+def did_you_mean(value: object, known: Iterable[str], most: int = 1) -> str:
     """The end of a message about an unknown name: the nearest known ones, or nothing if none is near.
 
     Args:
@@ -29,18 +28,18 @@ def did_you_mean(value: Any, known: Iterable[str], most: int = 1) -> str:
     return f"; did you mean {', '.join(repr(shown[key]) for key in close)}?" if close else ""
 
 
-def check_choice(name: str, value: Any, known: Iterable[str]) -> None:
+def check_choice(name: str, value: object, known: Iterable[str]) -> None:
     known = list(known)
     if value not in known:
         raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}{did_you_mean(value, known)}")
 
 
-def check_count(name: str, value: Any, least: int) -> None:
+def check_count(name: str, value: object, least: int) -> None:
     if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < least:
         raise ValueError(f"{name} must be a whole number >= {least}, got {_plain(value)!r}")
 
 
-def check_interval(name: str, value: Any, low: float, high: float) -> None:
+def check_interval(name: str, value: object, low: float, high: float) -> None:
     if (
         isinstance(value, bool)
         or not isinstance(value, numbers.Real)
@@ -50,12 +49,12 @@ def check_interval(name: str, value: Any, low: float, high: float) -> None:
         raise ValueError(f"{name} must be a number in [{low:g}, {high:g}], got {_plain(value)!r}")
 
 
-def check_finite(name: str, value: Any) -> None:
+def check_finite(name: str, value: object) -> None:
     if isinstance(value, bool) or not isinstance(value, numbers.Real) or not math.isfinite(value):
         raise ValueError(f"{name} must be a finite number, got {_plain(value)!r}")
 
 
-def check_edges(name: str, value: Any) -> np.ndarray:
+def check_edges(name: str, value: object) -> np.ndarray:
     """The edges of rings or cells (mm) as an array."""
     try:
         edges = np.asarray(value, dtype=np.float64)
@@ -67,7 +66,7 @@ def check_edges(name: str, value: Any) -> np.ndarray:
     return edges
 
 
-def rounding(value: Any) -> float:
+def rounding(value: object) -> float:
     """By how much a cosine may exceed 1 by rounding alone: 4 units in the last place of its own precision."""
     kind = getattr(value, "dtype", None)
     if type(value).__module__.split(".")[0] == "torch":
@@ -77,7 +76,7 @@ def rounding(value: Any) -> float:
     return ROUNDING_ULPS * float(np.finfo(kind if getattr(kind, "kind", "") == "f" else np.float64).eps)
 
 
-def check_cosine(name: str, value: Any, low: float = 0.0) -> float:
+def check_cosine(name: str, value: object, low: float = 0.0) -> float:
     """The cosine as a number in [low, 1]; what exceeds 1 by rounding is 1."""
     if isinstance(value, numbers.Real) and 1 < value <= 1 + rounding(value):
         return 1.0
@@ -85,7 +84,7 @@ def check_cosine(name: str, value: Any, low: float = 0.0) -> float:
     return float(value)
 
 
-def check_query(lib: Any, args: tuple, given: tuple) -> tuple:
+def check_query(lib: object, args: tuple, given: tuple) -> tuple:
     """Arguments of a query in their ranges, cosines that exceed 1 by rounding as 1; also refuses NaN.
 
     Args:

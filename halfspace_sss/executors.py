@@ -16,23 +16,24 @@ from contextlib import ExitStack, contextmanager
 from heapq import heappop, heappush
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any
+from typing import TypeVar
 
 import halfspace_sss
 from halfspace_sss.backend import BackendError, cores, limit_threads
 from halfspace_sss.checks import check_count
 
+R = TypeVar("R")
 LOCAL = "local"  # in place of an address: a cluster of Dask on this machine
 _PROCESS = os.getpid()  # that imported this module: a forked child has another one
 
 
 def completed(
     executor: Executor | None,
-    function: Callable[..., Any],
-    parts: Mapping[str, Sequence[Any]],
+    function: Callable[..., R],
+    parts: Mapping[str, Sequence[object]],
     needs: Mapping[str, Collection[str]] | None = None,
     most: int | None = None,
-) -> Iterator[tuple[str, Any]]:
+) -> Iterator[tuple[str, R]]:
     """Name and result of each part, in the order in which they end.
 
     Args:
@@ -162,7 +163,7 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _part(function: Callable[..., Any], arguments: Sequence[Any]) -> Any:
+def _part(function: Callable[..., R], arguments: Sequence[object]) -> R:
     if os.getpid() != _PROCESS:
         raise ValueError(
             "executor must start its processes by spawn, got a forked one, in which Dr.Jit hangs: "

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from halfspace_sss.provenance import naming, provenance, write_atomically
 
@@ -18,14 +17,14 @@ class KeptRows(dict):
         of: what the rows depend on besides versions and commit; rows of something else are dropped.
     """
 
-    def __init__(self, path: Path, of: Mapping[str, Any]) -> None:
+    def __init__(self, path: Path, of: Mapping[str, object]) -> None:
         told = provenance()
         head = json.dumps({**of, "versions": told["versions"], "commit": told["commit"]}, sort_keys=True)
         lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
         super().__init__(_whole(lines[1:]) if lines[:1] == [head] else [])
         self._path, self._head, self._begun = path, head, False
 
-    def __setitem__(self, name: str, row: Any) -> None:
+    def __setitem__(self, name: str, row: object) -> None:
         """Add a row, here and in the file."""
         if not self._begun:
             lines = (self._head, *(json.dumps(item) for item in self.items()))
@@ -40,7 +39,7 @@ class KeptRows(dict):
         self._path.unlink(missing_ok=True)
 
 
-def _whole(lines: list[str]) -> list[list[Any]]:
+def _whole(lines: list[str]) -> list[list[object]]:
     """Rows up to the first that was cut off."""
     rows = []
     for line in lines:

@@ -7,10 +7,9 @@ import importlib
 import sys
 import threading
 from collections.abc import Callable, Mapping
-from typing import Any
 
 
-def lazy_names(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+def lazy_names(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], object], Callable[[], list[str]]]:
     """`__getattr__` and `__dir__` of a package.
 
     Args:
@@ -18,7 +17,7 @@ def lazy_names(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], 
         homes: module within the package by public name; "" for a name that is itself a module of the package.
     """
 
-    def get(name: str) -> Any:
+    def get(name: str) -> object:
         if name not in homes:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         module = importlib.import_module(f"{package}.{homes[name] or name}")
@@ -38,7 +37,7 @@ def once(f: Callable) -> Callable:
     cached, lock = functools.cache(f), threading.RLock()
 
     @functools.wraps(f)
-    def answer(*args: Any) -> Any:
+    def answer(*args: object) -> object:
         with lock:
             return cached(*args)
 

@@ -13,8 +13,9 @@ import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import TypeAlias
 
+JsonDict: TypeAlias = "dict[str, None | bool | float | str | list | dict]"  # what JSON holds
 LARGEST, LARGEST_TEXT = 10**9, 10**7  # bytes
 LIBRARIES = ("halfspace-sss", "numpy", "drjit", "mitsuba", "torch", "xarray", "zarr")
 
@@ -39,7 +40,7 @@ def _version(name: str) -> str | None:
         return None
 
 
-def provenance(**parameters: Any) -> dict[str, Any]:
+def provenance(**parameters: object) -> JsonDict:
     """Command, parameters, versions, commit and platform, ready for JSON."""
     versions = {name: result for name in LIBRARIES if (result := _version(name))}
     command = " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
@@ -69,7 +70,7 @@ def path_of(path: str | os.PathLike) -> Path:
     return UPath(str(path))
 
 
-def is_remote(path: Any) -> bool:
+def is_remote(path: str | os.PathLike) -> bool:
     """Whether `path_of` found it to be in an object store, where files are whole or absent and nothing is renamed."""
     return hasattr(path, "storage_options")
 
@@ -91,7 +92,7 @@ def check_folder(folder: str | Path) -> Path:
     return path
 
 
-def _check_store(path: Any) -> None:
+def _check_store(path: Path) -> None:
     """That an object store can be written to; its packages raise errors of their own kinds."""
     probe = path / f".{platform.node()}.{os.getpid()}"
     try:

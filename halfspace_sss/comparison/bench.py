@@ -13,7 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from types import ModuleType
 
 import numpy as np
 
@@ -26,13 +26,13 @@ from halfspace_sss.physics.medium import Medium
 from halfspace_sss.physics.reflectance import _inverse
 from halfspace_sss.registry import bssrdf, models
 from halfspace_sss.tracing.tallies import AngularTally, FluxTally
-from halfspace_sss.tracing.walk import pass_seed, walk
+from halfspace_sss.tracing.walk import Tally, pass_seed, walk
 
 MEDIA = ((0.75, 0.0, 1.3), (0.99, 0.0, 1.5), (0.999, 0.9, 1.3))
 MAP_MEDIA = ((0.75, 0.0, 1.3), (0.99, 0.8, 1.5))
 ROULETTE_DEPTHS = (5, 64, 256, 1024)
 REPEATS = 3
-Row = dict[str, Any]
+Row = dict[str, bool | float | str]
 Media = Sequence[tuple[float, float, float]]  # albedo, g, eta
 
 
@@ -43,7 +43,7 @@ def _medium(albedo: float, g: float, eta: float) -> Medium:
 def _walk_once(medium: Medium, lanes: int, per_lane: int, seed: int, peel_off: bool) -> tuple[np.ndarray, int, float]:
     """Reflectance of each lane, events and seconds of one launch at normal incidence."""
     types = array_types()
-    tally: Any = FluxTally(types)
+    tally: Tally = FluxTally(types)
     if peel_off:
         tally = AngularTally(types, medium.g, medium.eta, np.array([1.0]), np.array([0.0]))
     started = time.perf_counter()
@@ -74,7 +74,7 @@ def bench_walk(lanes: int = 32768, per_lane: int = 64, media: Media = MEDIA) -> 
             yield row
 
 
-def _half_space(mi: Any, albedo: float, g: float, eta: float, rr_depth: int, size: int) -> Any:
+def _half_space(mi: ModuleType, albedo: float, g: float, eta: float, rr_depth: int, size: int) -> object:
     """Orthographic camera onto a lit plane: by reciprocity a pixel is the reflectance at normal incidence."""
     T = mi.ScalarTransform4f
     phase = {"type": "hg", "g": g} if g else {"type": "isotropic"}
@@ -118,7 +118,7 @@ def bench_volpath(
             yield row | {"equal_error_ratio": ours["efficiency"] / efficiency}
 
 
-def _rate(call: Callable[[], Any], n: int, least_seconds: float) -> float:
+def _rate(call: Callable[[], object], n: int, least_seconds: float) -> float:
     """Queries per second, median of repeats that each last at least `least_seconds`."""
     call()
     rates = []
@@ -131,7 +131,7 @@ def _rate(call: Callable[[], Any], n: int, least_seconds: float) -> float:
     return statistics.median(rates)
 
 
-def _cpu_seconds(call: Callable[[], Any]) -> float:
+def _cpu_seconds(call: Callable[[], object]) -> float:
     started = time.process_time()
     call()
     return time.process_time() - started
@@ -212,7 +212,7 @@ def peak_memory() -> float | None:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**30 if sys.platform == "darwin" else 2**20)
 
 
-def machine() -> dict[str, Any]:
+def machine() -> dict[str, int | str | None]:
     """What the figures depend on: processor, number of its threads, system."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()

@@ -12,16 +12,17 @@ from dataclasses import dataclass
 from html import escape
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from halfspace_sss.backend import BackendError
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.provenance import check_folder, provenance, write_together
+from halfspace_sss.provenance import JsonDict, check_folder, provenance, write_together
 
 if TYPE_CHECKING:
     import pandas
+    from matplotlib.figure import Figure
 
 TRACED = "path_traced"
 UNITS = {
@@ -118,7 +119,7 @@ class CurveSet:
         self.plot().savefig(file, format="png")
         return f'<img src="data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}">'
 
-    def plot(self) -> Any:
+    def plot(self) -> Figure:
         """A `matplotlib.figure.Figure`: S over r for each direction of incidence, and its ratio to the traced curve.
 
         Raises:
@@ -209,7 +210,7 @@ class CurveSet:
         spread = math.sqrt((error**2).sum()) / flux
         return {"L1": L1, "bias": gap.sum() / flux, "noise": noise, "bias_standard_error": spread}
 
-    def parameters(self) -> dict[str, Any]:
+    def parameters(self) -> JsonDict:
         """Everything that defines the result, ready for JSON."""
         medium = {name: getattr(self.medium, name) for name in ("sigma_s", "sigma_a", "g", "eta", "sigma_t", "albedo")}
         names = ("title", "theta_i_deg", "theta_o_deg", "delta_phi_deg", "line_deg", "half_width", "orders", "series")
@@ -260,7 +261,7 @@ class CurveSet:
             warnings.warn(f"the figure could not be drawn: {type(error).__name__}: {error}", stacklevel=2)
             return {}
 
-    def _write(self, folder: Path, name: str, content: dict[str, Any]) -> list[Path]:
+    def _write(self, folder: Path, name: str, content: dict[str, bytes | str]) -> list[Path]:
         about = {**provenance(**self.parameters()), "units": UNITS, "notes": list(self.notes)}
         about |= {"seconds_tracing": self.seconds, "evaluations_per_s": dict(self.evaluations_per_s)}
         content = {**content, f"{name}.json": json.dumps({**about, "files": sorted(content)}, indent=1) + "\n"}

@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterable
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -161,7 +161,7 @@ def _known(deviation: np.ndarray, noise: np.ndarray, energy: np.ndarray) -> Nois
     By the jackknife over the directions; twice the variance, as each pair of them stands in the maps of both.
     """
 
-    def square(*sums: Any) -> Any:
+    def square(*sums: float | np.ndarray) -> float | np.ndarray:
         a, b, total = sums
         return (a * a - b * b) / np.where(total > 0, total, 1.0) ** 2
 
@@ -294,7 +294,7 @@ def error_table(
 
     chosen = list(names or models())
     parts = {label: (label, reference, chosen) for label, reference in zip(labels, maps)}
-    rows: dict[str, list[dict[str, Any]]] = {}
+    rows: dict[str, list[dict[str, float | str]]] = {}
     for label, result in completed(executor, _rows, parts):
         rows[label] = result
         if progress:
@@ -302,7 +302,7 @@ def error_table(
     return pandas.DataFrame([row for label in parts for row in rows[label]])
 
 
-def _rows(label: str, reference: TracedMaps, names: list[str]) -> list[dict[str, Any]]:
+def _rows(label: str, reference: TracedMaps, names: list[str]) -> list[dict[str, float | str]]:
     """Of one medium, a row for each model that accepts it."""
     rows, m = [], reference.medium
     for name in names:

@@ -7,11 +7,10 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Any
 
 import numpy as np
 
-from halfspace_sss.arrays import library
+from halfspace_sss.arrays import Lanes, library
 from halfspace_sss.backend import array_types
 from halfspace_sss.maps.grid import MapGrid, cell_edges, map_directions, radial_scale
 from halfspace_sss.physics.backbone import warp
@@ -78,11 +77,11 @@ class MapTally:
     types: ModuleType
     n_r: int
     n_psi: int
-    phase: Callable[[Any, Scatter], Any]
+    phase: Callable[[Lanes, Scatter], Lanes]
     directions: list[tuple]
-    inverse_scale: Any
-    low: Any
-    rate: Any
+    inverse_scale: Lanes
+    low: Lanes
+    rate: Lanes
     cells: CellSums
 
     def start(self, lanes: int) -> tuple:
@@ -108,7 +107,7 @@ class MapTally:
             self.cells.add(event.weight * total / HITS, index, event.lane, inside & (event.order > 1))
         return sums
 
-    def _choose(self, q: list, target: Any) -> tuple[Any, tuple]:
+    def _choose(self, q: list, target: Lanes) -> tuple[Lanes, tuple]:
         """The observation in whose share of the running sum the target lies."""
         import drjit as dr
 
@@ -122,7 +121,7 @@ class MapTally:
             chosen = tuple(dr.select(beyond, self.directions[i][c], v) for c, v in zip((0, 1, 3), chosen))
         return k, chosen
 
-    def _cell(self, x: Any, y: Any) -> tuple[Any, Any]:
+    def _cell(self, x: Lanes, y: Lanes) -> tuple[Lanes, Lanes]:
         import drjit as dr
 
         Int32, UInt32 = self.types.Int32, self.types.UInt32

@@ -13,11 +13,10 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 import numpy as np
 
-from halfspace_sss.arrays import library
+from halfspace_sss.arrays import Lanes, library
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count
 from halfspace_sss.executors import completed
@@ -69,7 +68,7 @@ class Groups:
     def __len__(self) -> int:
         return len(self.albedo)
 
-    def __getitem__(self, index: Any) -> Groups:
+    def __getitem__(self, index: np.ndarray | slice) -> Groups:
         return Groups(*(getattr(self, f.name)[index] for f in fields(self)))
 
     @property
@@ -132,7 +131,7 @@ class _GroupCells(CellSums):
         super().__init__(types, cells, 2 * groups)
         self.half = lanes_per_group // 2
 
-    def add(self, value: Any, cell: Any, lane: Any, active: Any) -> None:
+    def add(self, value: Lanes, cell: Lanes, lane: Lanes, active: Lanes) -> None:
         super().add(value, cell, lane // self.half, active)
 
 
@@ -146,10 +145,10 @@ def _group_tally(types: ModuleType, groups: Groups, grid: CellGrid, lanes_per_gr
     """
     import drjit as dr
 
-    def lanes(values: np.ndarray) -> Any:
+    def lanes(values: np.ndarray) -> Lanes:
         return types.Float(np.repeat(values, lanes_per_group).astype(np.float32))
 
-    def phase(cosine: Any, event: Scatter) -> Any:
+    def phase(cosine: Lanes, event: Scatter) -> Lanes:
         last, first = eval_hg(cosine, g), eval_hg(event.first, g)
         return 2 * last * first / (first + last)
 

@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from halfspace_sss.maps.grid import MapGrid, cell_edges, map_directions
 from halfspace_sss.maps.map_tracing import MapUnit, UnitResult, trace_unit
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import ProgressText
-from halfspace_sss.provenance import is_remote, naming, path_of, provenance
+from halfspace_sss.provenance import JsonDict, is_remote, naming, path_of, provenance
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -229,7 +229,7 @@ def _units(
     ]
 
 
-def _check(media: Any, target_error: Any, n_paths: Any, seed: Any, share: Any) -> None:
+def _check(media: object, target_error: object, n_paths: object, seed: object, share: object) -> None:
     if not isinstance(media, Mapping) or not media:
         raise ValueError(f"media must map at least one name to a Medium, got {media!r}")
     for name, medium in media.items():
@@ -250,7 +250,7 @@ def _check(media: Any, target_error: Any, n_paths: Any, seed: Any, share: Any) -
 
 def _parameters(
     medium: Medium, grid: MapGrid, target_error: float | None, n_paths: int | None, seed: int, backend: str
-) -> dict[str, Any]:
+) -> JsonDict:
     """What defines the contents of a store; a resumed run must agree in all of it."""
     numbers = {k: np.asarray(getattr(medium, k)).tolist() for k in ("sigma_s", "sigma_a", "g", "eta")}
     stop = {"target_error": target_error, "n_paths": n_paths}
@@ -289,7 +289,7 @@ def _template(medium: Medium, grid: MapGrid, seed: int) -> xr.Dataset:
     return dataset
 
 
-def _create(path: Path, medium: Medium, grid: MapGrid, seed: int, asked: dict[str, Any]) -> None:
+def _create(path: Path, medium: Medium, grid: MapGrid, seed: int, asked: JsonDict) -> None:
     """A store of the right shape, made under another name and renamed; in an object store, with its metadata last.
 
     Encoded in memory: zarr's threads, which an interrupt does not end, would write on into a folder just removed.
@@ -324,7 +324,7 @@ def _exists(path: Path) -> bool:
     return (path / METADATA).exists() if is_remote(path) else path.exists()
 
 
-def _at(path: Path) -> dict[str, Any]:
+def _at(path: Path) -> JsonDict:
     """A store in the words of xarray."""
     return {"store": str(path), "storage_options": dict(path.storage_options)} if is_remote(path) else {"store": path}
 
@@ -347,7 +347,7 @@ def _open(path: Path) -> xr.Dataset:
     return dataset
 
 
-def _open_same(path: Path, asked: dict[str, Any]) -> xr.Dataset:
+def _open_same(path: Path, asked: JsonDict) -> xr.Dataset:
     """The store at a path, which must have been made with the same parameters."""
     dataset = _open(path)
     result = json.loads(dataset.attrs[ASKED])
@@ -379,7 +379,7 @@ def _write(path: Path, channel: int, theta: int, result: UnitResult) -> None:
     import xarray as xr
 
     dims = ("channel", "theta", "phi", "r", "psi")
-    data: dict[str, Any] = {name: (dims, getattr(result, name)[None, None]) for name in DATA}
+    data: dict[str, tuple] = {name: (dims, getattr(result, name)[None, None]) for name in DATA}
     for name, kind in (("n_paths", np.uint64), ("n_events", np.uint64), ("mean_cell_error", float), ("seconds", float)):
         data[name] = (dims[:2], np.full((1, 1), getattr(result, name), kind))
     region = {"channel": slice(channel, channel + 1), "theta": slice(theta, theta + 1)}

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints, ValidationError
+from pydantic_core import ErrorDetails
 
 from halfspace_sss.checks import did_you_mean
 from halfspace_sss.materials.material import Material
@@ -24,7 +25,7 @@ COEFFICIENTS = (("sigma_s", "sigma_a"), ("sigma_s_prime", "sigma_a"), ("sigma_t"
 Quantity = Literal["sigma_s", "sigma_s_prime", "sigma_t", "sigma_a", "albedo", "g", "eta", "sample_ml"]
 
 
-def _as_list(value: Any) -> Any:
+def _as_list(value: object) -> object:
     return value if isinstance(value, list) else [value]
 
 
@@ -107,7 +108,7 @@ def parse(text: str, origin: str) -> list[Material]:
     return materials
 
 
-def _problem(error: Any, raw: dict) -> str:
+def _problem(error: ErrorDetails, raw: dict) -> str:
     loc = list(error["loc"])
     where, model = "", MaterialFile
     if len(loc) > 1 and loc[0] == "material":

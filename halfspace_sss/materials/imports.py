@@ -7,7 +7,7 @@ import os
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,6 +15,9 @@ from halfspace_sss.backend import BackendError
 from halfspace_sss.checks import check_choice
 from halfspace_sss.materials.material import Material
 from halfspace_sss.physics.medium import Medium
+
+if TYPE_CHECKING:
+    import MaterialX as mx  # noqa: N813
 
 CHANNELS = ("R", "G", "B")
 OPENPBR = {  # defaults of OpenPBR 1.1
@@ -93,7 +96,7 @@ def _of_materialx(path: Path, unit: float) -> Iterator[Material]:
             raise ValueError(f"{path}: material {name!r}: {error}") from error
 
 
-def _written(node: Any) -> dict[str, Any]:
+def _written(node: mx.Node) -> dict[str, object]:
     """The inputs that a node writes: numbers, tuples and texts; "a connection" where it has no value."""
     results = {}
     for each in node.getActiveInputs():
@@ -103,7 +106,7 @@ def _written(node: Any) -> dict[str, Any]:
     return results
 
 
-def _not_taken(node: Any) -> dict[str, Any]:
+def _not_taken(node: mx.Node) -> dict[str, object]:
     """What changes the picture of a surface and is in no medium, with its values."""
     written = {"specular_roughness": ROUGHNESS} | _written(node)
     found = {key: written[key] for key, none in NO_MEDIUM.items() if written.get(key, none) != none}
@@ -115,14 +118,14 @@ def _not_taken(node: Any) -> dict[str, Any]:
     return found | by_others | geometry
 
 
-def _warn_of(path: Path, name: str, not_taken: dict[str, Any]) -> None:
+def _warn_of(path: Path, name: str, not_taken: dict[str, object]) -> None:
     """One warning of all that changes the picture of a material and is in no medium."""
     if not_taken:
         told = ", ".join(f"{key} = {value}" for key, value in not_taken.items())
         warnings.warn(f"{path}: material {name!r}: its medium alone is imported, without {told}", stacklevel=4)
 
 
-def _value(node: Any, key: str, default: Any) -> Any:
+def _value(node: mx.Node, key: str, default: float | tuple[float, ...]) -> float | tuple[float, ...] | np.ndarray:
     """The value of an input, colours in linear Rec. 709."""
     result = node.getInput(key)
     if result is None:
@@ -174,7 +177,7 @@ def _of_gltf(path: Path, unit: float) -> Iterator[Material]:
             raise ValueError(f"{path}: material {name!r}: {error}") from error
 
 
-def _not_taken_of_gltf(material: Any, surface: Any, parts: dict[str, Any]) -> dict[str, Any]:
+def _not_taken_of_gltf(material: object, surface: object, parts: dict[str, object]) -> dict[str, object]:
     """What changes the picture of a material of glTF and is in no medium, with its values."""
     none = {"baseColorFactor": [1.0] * 4, "metallicFactor": 0.0, "roughnessFactor": 0.0, "emissiveFactor": [0.0] * 3}
     owners = [vars(surface), vars(material), *(parts.get(name, {}) for name in TAKEN_OF_GLTF)]

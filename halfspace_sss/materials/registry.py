@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from importlib import resources
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -138,7 +138,7 @@ def _from_path(path: str | os.PathLike) -> Iterator[tuple[str, Material]]:
             yield str(file), material
 
 
-def _from_entry_point(entry: Any) -> Iterator[tuple[str, Material]]:
+def _from_entry_point(entry: EntryPoint) -> Iterator[tuple[str, Material]]:
     origin, offered = f"entry point {entry.name!r} of group {ENTRY_POINT_GROUP}", entry.load()
     if isinstance(offered, (str, os.PathLike)):
         yield from _from_path(offered)
@@ -163,7 +163,7 @@ def names() -> list[str]:
     return _registry.names()
 
 
-def load(name: str, *, dilution: float | None = None, g: Any = None) -> Material:
+def load(name: str, *, dilution: float | None = None, g: float | Sequence[float] | None = None) -> Material:
     """The material of that name.
 
     Args:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -117,13 +117,13 @@ class SpectralMedium:
             low, high = self.wavelengths[[0, -1]]
         return self.medium(low + (high - low) * (np.arange(n) + 0.5) / n)
 
-    def surface(self) -> dict[str, Any]:
+    def surface(self) -> dict[str, object]:
         """The medium as parameters of the surface `translucent` of a Mitsuba dictionary, under a spectral variant.
 
         The index is the mean over the visible range: renders have no dispersion.
         """
 
-        def spectrum(values: np.ndarray) -> dict[str, Any] | float:
+        def spectrum(values: np.ndarray) -> dict[str, object] | float:
             texts = (", ".join(f"{v:.9g}" for v in row) for row in (self.wavelengths, values))
             named = dict(zip(("wavelengths", "values"), texts))
             return {"type": "irregular", **named} if np.ptp(values) else float(values[0])

@@ -10,7 +10,7 @@ torch, evaluation does not.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from halfspace_sss.backend import BackendError
 from halfspace_sss.lazy import lazy_names
@@ -31,7 +31,7 @@ _found, __dir__ = lazy_names(
 )
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     try:
         return _found(name)
     except ModuleNotFoundError as error:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import torch
+
 
 import numpy as np
 
-from halfspace_sss.arrays import broadcast_query, is_torch, library
+from halfspace_sss.arrays import Lanes, Real, broadcast_query, is_torch, library
 from halfspace_sss.interface.query import Query
 from halfspace_sss.neural.features import medium_features, symmetric_features, travel
 from halfspace_sss.neural.hypernetwork import N_TERMS, Hypernetwork, Layers, log_calibration
@@ -16,7 +20,9 @@ from halfspace_sss.physics.backbone import backbone_shape, length_scale
 from halfspace_sss.physics.fresnel import F_t
 
 
-def neural_S(sigma_t: Any, albedo: Any, g: Any, eta: Any, r: Any, mu_i: Any, phi_i: Any, mu_o: Any, phi_o: Any) -> Any:
+def neural_S(
+    sigma_t: Real, albedo: Real, g: Real, eta: Real, r: Real, mu_i: Real, phi_i: Real, mu_o: Real, phi_o: Real
+) -> Real:
     """S of order >= 2 of the model `neural` in 1/(mm² sr), differentiable in all arguments, torch or Dr.Jit.
 
     On CUDA, Dr.Jit evaluates the layers, and adds up their derivatives, in half precision.
@@ -48,7 +54,7 @@ def neural_S(sigma_t: Any, albedo: Any, g: Any, eta: Any, r: Any, mu_i: Any, phi
     return sigma_t * sigma_t * F_t(mu_i, eta) * F_t(mu_o, eta) * G
 
 
-def _torch_network(hyper: Hypernetwork, c: list, features: list) -> Any:
+def _torch_network(hyper: Hypernetwork, c: list, features: list) -> torch.Tensor:
     import torch
 
     x = torch.stack(torch.broadcast_tensors(*features), dim=-1)
@@ -62,12 +68,12 @@ def _torch_network(hyper: Hypernetwork, c: list, features: list) -> Any:
     return x[..., 0]
 
 
-def _torch_terms(hyper: Hypernetwork, c: list, like: Any) -> Any:
+def _torch_terms(hyper: Hypernetwork, c: list, like: torch.Tensor) -> torch.Tensor:
     """Coefficients of `log_calibration`."""
     return _torch_layers(hyper.calibration_layers, c, like)
 
 
-def _torch_layers(layers: Layers, c: list, like: Any) -> Any:
+def _torch_layers(layers: Layers, c: list, like: torch.Tensor) -> torch.Tensor:
     import torch
 
     h = torch.stack([torch.as_tensor(v).to(like).reshape(()) for v in c])
@@ -78,13 +84,13 @@ def _torch_layers(layers: Layers, c: list, like: Any) -> Any:
     return h
 
 
-def _torch(array: np.ndarray, like: Any) -> Any:
+def _torch(array: np.ndarray, like: torch.Tensor) -> torch.Tensor:
     import torch
 
     return torch.from_numpy(np.asarray(array, np.float64)).to(like)
 
 
-def _drjit_terms(hyper: Hypernetwork, c: list, like: Any) -> list:
+def _drjit_terms(hyper: Hypernetwork, c: list, like: Lanes) -> list:
     """Coefficients of `log_calibration`."""
     import drjit as dr
 
@@ -94,7 +100,7 @@ def _drjit_terms(hyper: Hypernetwork, c: list, like: Any) -> list:
     return [dr.gather(kind, h, index(k)) for k in range(N_TERMS)]
 
 
-def _drjit_layers(layers: Layers, c: list, kind: type) -> Any:
+def _drjit_layers(layers: Layers, c: list, kind: type) -> Lanes:
     import drjit as dr
 
     h = dr.tensor_t(kind)(dr.concat([kind(v) for v in c]), (1, len(c)))
@@ -105,13 +111,13 @@ def _drjit_layers(layers: Layers, c: list, kind: type) -> Any:
     return h
 
 
-def _drjit(array: np.ndarray, kind: type) -> Any:
+def _drjit(array: np.ndarray, kind: type) -> Lanes:
     import drjit as dr
 
     return dr.tensor_t(kind)(np.ascontiguousarray(array, np.float32))
 
 
-def _drjit_network(hyper: Hypernetwork, c: list, features: list) -> Any:
+def _drjit_network(hyper: Hypernetwork, c: list, features: list) -> Lanes:
     import drjit as dr
     from drjit import nn
 

@@ -6,9 +6,7 @@ network of them is reciprocal and mirror-invariant exactly, without training.
 
 from __future__ import annotations
 
-from typing import Any
-
-from halfspace_sss.arrays import library
+from halfspace_sss.arrays import Library, Real, library
 from halfspace_sss.interface.query import Query
 from halfspace_sss.physics.backbone import U_MAX, warp
 
@@ -17,7 +15,7 @@ R_SMALLEST = 0.01  # of min(L, mfp): below it the learnt factor stays as it is t
 DEPTHS = (0.25, 1.0, 4.0)  # mean free paths along the refracted rays; L is the fourth
 RIDGE, ROUNDING = 1e-3, 1e-5
 SOFT = 1e-4  # share of the squared depth that keeps the logarithm of a distance finite
-Ray = tuple[Any, Any, Any]
+Ray = tuple[Real, Real, Real]
 
 
 def travel(q: Query) -> tuple[Ray, Ray]:
@@ -27,7 +25,7 @@ def travel(q: Query) -> tuple[Ray, Ray]:
     return incoming, (q.sin_o * lib.cos(q.phi_o), q.sin_o * lib.sin(q.phi_o), q.mu_o_in)
 
 
-def symmetric_features(lib: Any, r: Any, incoming: Ray, outgoing: Ray, L: Any) -> list[Any]:
+def symmetric_features(lib: Library, r: Real, incoming: Ray, outgoing: Ray, L: Real) -> list[Real]:
     """The features of a query, each of order one.
 
     With (x, y, mu') of both rays: u/4 where u = log(exp(r/L) - 1); x_i + x_o; mu_i' + mu_o' - 1; (x_i - x_o)²;
@@ -64,7 +62,7 @@ def symmetric_features(lib: Any, r: Any, incoming: Ray, outgoing: Ray, L: Any) -
     ]
 
 
-def _meeting(lib: Any, r: Any, incoming: Ray, outgoing: Ray) -> tuple[Any, Any]:
+def _meeting(lib: Library, r: Real, incoming: Ray, outgoing: Ray) -> tuple[Real, Real]:
     """How closely the refracted rays pass each other, and how far light travels until there.
 
     At depth z they are |r - z v| apart, v = d_i/mu_i' + d_o/mu_o' in the plane; the least is at
@@ -80,7 +78,7 @@ def _meeting(lib: Any, r: Any, incoming: Ray, outgoing: Ray) -> tuple[Any, Any]:
     return 0.5 * lib.log(along * along + across * across + RIDGE), path / (1 + path)
 
 
-def medium_features(lib: Any, albedo: Any, g: Any, eta: Any, L: Any) -> list[Any]:
+def medium_features(lib: Library, albedo: Real, g: Real, eta: Real, L: Real) -> list[Real]:
     """The features of a medium, each of order one and smooth over albedo [0, 1], g [-0.5, 0.98], eta [1, 2]."""
     albedo_prime = albedo * (1 - g) / (1 - albedo * g)
     log, x = lib.log, eta - 1

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from halfspace_sss.arrays import library
+from halfspace_sss.arrays import Real, library
 from halfspace_sss.neural.features import N_FEATURES, medium_features
 from halfspace_sss.neural.network import Network, layer_shapes
 from halfspace_sss.physics.backbone import length_scale
@@ -72,7 +71,7 @@ class Hypernetwork:
     def shapes(self) -> list[tuple[int, int]]:
         return layer_shapes(N_FEATURES, self.width, self.depth)
 
-    def parameters(self) -> dict[str, Any]:
+    def parameters(self) -> dict[str, np.ndarray]:
         """Arrays by name, for the file of weights."""
         layers = {**named_layers("medium", self.medium_layers), **named_layers(CALIBRATION, self.calibration_layers)}
         return {**layers, "base": self.base, "basis": self.basis}
@@ -96,7 +95,7 @@ N_TERMS = 4
 CALIBRATION = "balance"  # what files call the layers of the calibration
 
 
-def log_calibration(c: Sequence[Any], mu: Any) -> Any:
+def log_calibration(c: Sequence[Real], mu: Real) -> Real:
     """log a(mu) = sum_k c_k T_k(2 mu - 1) of an outside cosine, by Clenshaw's recurrence; 0 for no terms.
 
     Args:

@@ -6,11 +6,15 @@ import functools
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from halfspace_sss.arrays import Lanes, Real
 from halfspace_sss.neural.perceptron import Perceptron, relu, silu
+
+if TYPE_CHECKING:
+    import torch
 
 NUMPY_BLOCK = 4096  # queries whose activations stay in the cache
 
@@ -23,16 +27,16 @@ def layer_shapes(n_in: int, width: int, depth: int) -> list[tuple[int, int]]:
 class Activation(NamedTuple):
     """A function of each number in the three libraries; NumPy's changes its argument."""
 
-    numpy: Callable[[np.ndarray], Any]
-    torch: Callable[[Any], Any]
-    drjit: Callable[[Any], Any]
+    numpy: Callable[[np.ndarray], object]
+    torch: Callable[[torch.Tensor], torch.Tensor]
+    drjit: Callable[[Lanes], Lanes]
 
 
 def _silu_numpy(h: np.ndarray) -> None:
     h /= 1 + np.exp(-np.maximum(h, -80.0))
 
 
-def _silu_torch(h: Any) -> Any:
+def _silu_torch(h: torch.Tensor) -> torch.Tensor:
     import torch
 
     return torch.nn.functional.silu(h)
@@ -77,7 +81,7 @@ class Network:
             digest.update(np.ascontiguousarray(array, np.float32).tobytes())
         return digest.hexdigest()
 
-    def __call__(self, features: Sequence[Any]) -> Any:
+    def __call__(self, features: Sequence[Real]) -> Real:
         """The output for features that are arrays of one shape, in their library and precision."""
         kind = type(features[0]).__module__.split(".")[0]
         evaluate = {"torch": self._torch, "drjit": self._drjit, "mitsuba": self._drjit}.get(kind, self._numpy)
@@ -103,7 +107,7 @@ class Network:
     def _tensors(self) -> dict:
         return {}
 
-    def _torch(self, features: Sequence[Any]) -> Any:
+    def _torch(self, features: Sequence[torch.Tensor]) -> torch.Tensor:
         import torch
 
         x = torch.stack(torch.broadcast_tensors(*features), dim=-1)
@@ -120,5 +124,5 @@ class Network:
     def _perceptron(self) -> Perceptron:
         return Perceptron([W.T for W in self.matrices], self.biases, self.activation.drjit)
 
-    def _drjit(self, features: Sequence[Any]) -> Any:
+    def _drjit(self, features: Sequence[Lanes]) -> Lanes:
         return self._perceptron(features)[0]

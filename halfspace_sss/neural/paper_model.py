@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
+from halfspace_sss.arrays import Library, Real
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.interface.query import Query
 from halfspace_sss.neural.material_model import load_network
@@ -21,7 +21,9 @@ RADIUS = 4.0  # L; positions are divided by it
 T_SMALLEST = 1e-6  # product of transmittances; the network holds S, which is 0 where they are
 
 
-def paper_inputs(lib: Any, r: Any, line: Any, w_i: tuple[Any, Any], w_o: tuple[Any, Any], L: Any) -> list[Any]:
+def paper_inputs(
+    lib: Library, r: Real, line: Real, w_i: tuple[Real, Real], w_o: tuple[Real, Real], L: Real
+) -> list[Real]:
     """Six numbers: (x, y) of x_o - x_i over 4 L and the horizontal parts of w_i and w_o.
 
     Args:
@@ -34,7 +36,7 @@ def paper_inputs(lib: Any, r: Any, line: Any, w_i: tuple[Any, Any], w_o: tuple[A
     return [rho * lib.cos(line), rho * lib.sin(line), *parts]
 
 
-def query_inputs(q: Query, L: Any) -> list[Any]:
+def query_inputs(q: Query, L: Real) -> list[Real]:
     """The six numbers of a query, in the frame in which w_i has azimuth 0, at most 12 L away."""
     lib = q.lib
     sines = [sine(mu) for mu in (q.mu_i, q.mu_o)]
@@ -72,17 +74,17 @@ class NeuralPaper(BSSRDF):
     def checksums(self) -> tuple[str, ...]:
         return tuple(f"{network.checksum} {scale!r}" for network, scale in self.trained)
 
-    def G(self, q: Query) -> Any:
+    def G(self, q: Query) -> Real:
         return q.lib.maximum(self.G_unclamped(q), 0.0)
 
-    def G_unclamped(self, q: Query) -> Any:
+    def G_unclamped(self, q: Query) -> Real:
         """G before negative values are set to zero."""
         m = self.medium
         queries = [q] if m.n_channels is None else channel_queries(q, m)
         values = [self._one(*parts) for parts in zip(queries, channels(m), self.trained)]
         return values[0] if m.n_channels is None else q.lib.stack(values)
 
-    def _one(self, query: Query, m: Medium, trained: tuple[Network, float]) -> Any:
+    def _one(self, query: Query, m: Medium, trained: tuple[Network, float]) -> Real:
         network, scale = trained
         q = query.in_float64()  # the raw output crosses zero, where float32 has no digits
         lib, L = q.lib, q.constant(length_scale(m.albedo, m.g))

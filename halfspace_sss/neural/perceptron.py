@@ -10,29 +10,30 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
+
+from halfspace_sss.arrays import Lanes
 
 MOST_IN_HALF = 256.0  # of an input, which are of order one: a layer with weights of order one stays below 65504
 PACKET = 4  # numbers of a row that loops read at once
 
 
-def hard_swish(x: Any) -> Any:
+def hard_swish(x: Lanes) -> Lanes:
     """x clip(x/6 + 1/2, 0, 1): a fifth of the time of `silu`."""
     import drjit as dr
 
     return x * dr.clip(x * (1 / 6) + 0.5, 0, 1)
 
 
-def relu(x: Any) -> Any:
+def relu(x: Lanes) -> Lanes:
     """max(x, 0)."""
     import drjit as dr
 
     return dr.maximum(x, 0)
 
 
-def silu(x: Any) -> Any:
+def silu(x: Lanes) -> Lanes:
     """x / (1 + exp(-x))."""
     import drjit as dr
 
@@ -59,7 +60,7 @@ class Perceptron:
         self,
         matrices: Sequence[np.ndarray],
         biases: Sequence[np.ndarray],
-        activation: Callable[[Any], Any] = hard_swish,
+        activation: Callable[[Lanes], Lanes] = hard_swish,
         splits: Sequence[int] = (),
         looped: bool = False,
     ) -> None:
@@ -69,23 +70,23 @@ class Perceptron:
         self._packed: dict[type, tuple[list, list]] = {}  # by type of vector, so of each backend
 
     @classmethod
-    def named(cls, weights: Mapping[str, np.ndarray], matrix: str, bias: str, **more: Any) -> Perceptron:
+    def named(cls, weights: Mapping[str, np.ndarray], matrix: str, bias: str, **more: object) -> Perceptron:
         """That of the arrays `matrix`_k and `bias`_k, as many as there are."""
         n = sum(name.startswith(f"{matrix}_") for name in weights)
         return cls(*([weights[f"{name}_{k}"] for k in range(n)] for name in (matrix, bias)), **more)
 
-    def __call__(self, x: Sequence[Any]) -> list[Any]:
+    def __call__(self, x: Sequence[Lanes]) -> list[Lanes]:
         """The outputs, in single precision at least; the first layer has one part."""
         first = self.first(0, x, biased=True)
         return self.rest(self.activation(first)) if len(self.biases) > 1 else self.numbers(first)
 
-    def first(self, part: int, x: Sequence[Any], biased: bool = False) -> Any:
+    def first(self, part: int, x: Sequence[Lanes], biased: bool = False) -> Lanes:
         """U_part x, with b_0 if it is `biased`, as a vector."""
         x = self.vector(x)
         matrices, biases = self._views(x)
         return _product(matrices[part], x, biases[0] if biased else None)
 
-    def rest(self, x: Any) -> list[Any]:
+    def rest(self, x: Lanes) -> list[Lanes]:
         """The outputs, of a(x_1) as a vector; one layer follows at least."""
         matrices, biases = self._views(x)
         layers = list(zip(matrices[len(self.parts) :], biases[1:]))
@@ -93,7 +94,7 @@ class Perceptron:
             x = _product(W, self.activation(x) if k else x, b)
         return self.numbers(x)
 
-    def vector(self, x: Sequence[Any]) -> Any:
+    def vector(self, x: Sequence[Lanes]) -> Lanes:
         """Numbers as a vector that layers are asked with."""
         import drjit as dr
 
@@ -102,14 +103,14 @@ class Perceptron:
         return _listed(x) if by_loops or _is_double(kind) else cooperative(x)
 
     @staticmethod
-    def numbers(x: Any) -> list[Any]:
+    def numbers(x: Lanes) -> list[Lanes]:
         """A vector as numbers, in single precision at least."""
         import drjit as dr
 
         kind = _precise(x.type if _is_cooperative(x) else dr.value_t(type(x)))
         return [kind(v) for v in x]
 
-    def _views(self, x: Any) -> tuple[list, list]:
+    def _views(self, x: Lanes) -> tuple[list, list]:
         """Matrices and biases for products with a vector."""
         key, make = (x.type, _packed) if _is_cooperative(x) else (type(x), _rows)
         if key not in self._packed:
@@ -117,7 +118,7 @@ class Perceptron:
         return self._packed[key]
 
 
-def cooperative(x: Sequence[Any]) -> Any:
+def cooperative(x: Sequence[Lanes]) -> Lanes:
     """Numbers as a cooperative vector: in half precision on CUDA or where they have it, else in single precision."""
     import drjit as dr
     from drjit import nn
@@ -129,7 +130,7 @@ def cooperative(x: Sequence[Any]) -> Any:
     return nn.CoopVec(*(dr.float16_array_t(kind)(dr.clip(v, -MOST_IN_HALF, MOST_IN_HALF)) for v in x))
 
 
-def _listed(x: Sequence[Any]) -> Any:
+def _listed(x: Sequence[Lanes]) -> Lanes:
     """Numbers as a vector that loops take."""
     import drjit as dr
 
@@ -137,7 +138,7 @@ def _listed(x: Sequence[Any]) -> Any:
     return _kin(kind, "X")([kind(v) for v in x])
 
 
-def _is_cooperative(x: Any) -> bool:
+def _is_cooperative(x: Lanes) -> bool:
     from drjit import nn
 
     return isinstance(x, nn.CoopVec)
@@ -188,7 +189,7 @@ def _rows(vector: type, matrices: list[np.ndarray], biases: list[np.ndarray]) ->
     return results, [kind(np.asarray(b, dtype=precision).tolist()) for b in biases]
 
 
-def _product(W: Any, x: Any, bias: Any) -> Any:
+def _product(W: Lanes, x: Lanes, bias: Lanes) -> Lanes:
     """W x, with a bias if there is one."""
     import drjit as dr
     from drjit import nn
@@ -200,7 +201,7 @@ def _product(W: Any, x: Any, bias: Any) -> Any:
     UInt32, Packet = dr.uint32_array_t(kind), _kin(kind, PACKET)
     x = [*x, *[kind(0)] * (-len(x) % PACKET)]
 
-    def output(j: Any, out: Any) -> tuple:
+    def output(j: Lanes, out: Lanes) -> tuple:
         total = kind(0) if bias is None else dr.gather(kind, bias, j)
         for k in range(0, len(x), PACKET):
             row = dr.gather(Packet, rows, j * (len(x) // PACKET) + k // PACKET)

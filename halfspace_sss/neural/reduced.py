@@ -24,11 +24,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
-from halfspace_sss.arrays import library
+from halfspace_sss.arrays import Lanes, Real, library
 from halfspace_sss.interface.query import Query
 from halfspace_sss.neural.features import symmetric_features, travel
 from halfspace_sss.neural.hypernetwork import log_calibration
@@ -82,13 +81,13 @@ class ReducedNetworks:
     def _perceptrons(self) -> list[Perceptron]:
         return [Perceptron([W.T for W in n.matrices], n.biases, n.activation.drjit) for n in self.networks]
 
-    def functions(self, q: Query) -> list[Any]:
+    def functions(self, q: Query) -> list[Lanes]:
         """phi_0 ... phi_4 of a query in Dr.Jit."""
         values = [net(_features(q, L)) for net, L in zip(self._perceptrons, self.lengths)]
         return [sum(parts) for parts in zip(*values)]
 
 
-def shape_over_power(q: Query, albedo: Any, g: Any, log_factor: Any) -> Any:
+def shape_over_power(q: Query, albedo: Real, g: Real, log_factor: Real) -> Real:
     """S / albedo² without Fresnel transmittances, for sigma_t = 1, of numbers or arrays of a library."""
     lib = q.lib
     factor = lib.exp(lib.minimum(lib.maximum(log_factor, -LOG_RANGE), LOG_RANGE))
@@ -99,7 +98,7 @@ def _length(model: SymmetricModel) -> float:
     return float(length_scale(float(model.medium.albedo), float(model.medium.g)))
 
 
-def _features(q: Query, L: float) -> list[Any]:
+def _features(q: Query, L: float) -> list[Real]:
     return symmetric_features(q.lib, q.r, *travel(q), q.constant(L))
 
 

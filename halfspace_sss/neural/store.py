@@ -15,26 +15,25 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from halfspace_sss.checks import check_interval
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.provenance import check_folder, path_of, read_bytes, read_text, write_together
+from halfspace_sss.provenance import JsonDict, check_folder, path_of, read_bytes, read_text, write_together
 
 FORMAT = 1
 LARGEST = 1e4  # no weight of a network that works is as large
 
 
-def to_json(content: dict[str, Any]) -> str:
+def to_json(content: JsonDict) -> str:
     """The text of a JSON file with one line for each key; NumPy's numbers become Python's.
 
     Raises:
         TypeError: something in it has no form in JSON.
     """
 
-    def plain(value: Any) -> Any:
+    def plain(value: object) -> object:
         if isinstance(value, np.generic):
             return value.item()
         raise TypeError(f"content must be ready for JSON, got {value!r}")
@@ -47,7 +46,7 @@ def _record_path(path: Path) -> Path:
     return path.with_suffix(".json")
 
 
-def record_count(path: Path, record: Mapping[str, Any], key: str, most: int = 4096) -> int:
+def record_count(path: Path, record: JsonDict, key: str, most: int = 4096) -> int:
     """A whole number in [1, most] of the record of `path`; ValueError names file, key, bound and value."""
     value = record.get(key)
     if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
@@ -55,13 +54,13 @@ def record_count(path: Path, record: Mapping[str, Any], key: str, most: int = 40
     return value
 
 
-def record_number(path: Path, record: Mapping[str, Any], key: str, low: float, high: float) -> float:
+def record_number(path: Path, record: JsonDict, key: str, low: float, high: float) -> float:
     """A number in [low, high] of the record of `path`; ValueError names file, key, bound and value."""
     check_interval(f"{_record_path(path)}: {key}", record.get(key), low, high)
     return float(record[key])
 
 
-def save_weights(path: str | os.PathLike, kind: str, arrays: Mapping[str, np.ndarray], record: dict[str, Any]) -> Path:
+def save_weights(path: str | os.PathLike, kind: str, arrays: Mapping[str, np.ndarray], record: JsonDict) -> Path:
     """Write `path` (.safetensors) and its record (.json); together or not at all.
 
     Args:
@@ -87,7 +86,7 @@ def save_weights(path: str | os.PathLike, kind: str, arrays: Mapping[str, np.nda
     return path
 
 
-def load_weights(path: str | os.PathLike, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def load_weights(path: str | os.PathLike, kind: str) -> tuple[dict[str, np.ndarray], JsonDict]:
     """Arrays and record of a file of weights.
 
     Raises:
@@ -110,7 +109,7 @@ def checksum_of(path: str | os.PathLike, kind: str) -> str:
     return _read_record(path_of(path), kind)["sha256"]
 
 
-def _read_record(path: Path, kind: str) -> dict[str, Any]:
+def _read_record(path: Path, kind: str) -> JsonDict:
     if path.suffix != ".safetensors":
         raise ValueError(f"{path}: weights must be a .safetensors file (a pickle could run code), got {path.suffix!r}")
     where = _record_path(path)
@@ -131,7 +130,7 @@ def _read_record(path: Path, kind: str) -> dict[str, Any]:
     return record
 
 
-def _arrays(path: Path, data: bytes, record: dict[str, Any]) -> dict[str, np.ndarray]:
+def _arrays(path: Path, data: bytes, record: JsonDict) -> dict[str, np.ndarray]:
     from safetensors import SafetensorError
     from safetensors.numpy import load
 
@@ -198,7 +197,7 @@ def _digits(medium: Medium) -> dict[str, str]:
     return {name: f"{float(getattr(medium, name)):.8g}" for name in RATIOS}
 
 
-def check_medium(path: Path, record: Mapping[str, Any], medium: Medium) -> None:
+def check_medium(path: Path, record: JsonDict, medium: Medium) -> None:
     """ValueError if the weights of `path` were trained for another medium, whatever the file is called."""
     result = record.get("medium")
     if not isinstance(result, dict) or any(type(result.get(name)) not in (int, float) for name in RATIOS):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 from collections.abc import Sequence
-from typing import Any
 
+from halfspace_sss.arrays import Real
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.interface.query import Query
 from halfspace_sss.neural.features import symmetric_features, travel
@@ -18,7 +18,7 @@ from halfspace_sss.physics.medium import Medium
 LOG_RANGE = 30.0  # bound of the logarithm of the learnt factor
 
 
-def factored_G(network: Network, q: Query, albedo: Any, g: Any, eta: Any, calibration: Sequence[float] = ()) -> Any:
+def factored_G(network: Network, q: Query, albedo: Real, g: Real, eta: Real, calibration: Sequence[float] = ()) -> Real:
     """G = B(r) exp(network(features)) a(mu_i) a(mu_o) of one channel: positive, reciprocal and mirror-invariant.
 
     `calibration` are the coefficients of log a, see `calibration`; without them a is 1.
@@ -50,7 +50,7 @@ class SymmetricModel(BSSRDF):
         pairs = zip(self.networks, self.calibrations)
         return tuple(hashlib.sha256(f"{n.checksum} {tuple(c)}".encode()).hexdigest() for n, c in pairs)
 
-    def G(self, q: Query) -> Any:
+    def G(self, q: Query) -> Real:
         m, calibrations = self.medium, self.calibrations or [()] * len(self.networks)
         if m.n_channels is None:
             return factored_G(self.networks[0], q, m.albedo, m.g, m.eta, calibrations[0])

@@ -7,18 +7,17 @@ differentiated or differs from lane to lane.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
-from halfspace_sss.arrays import library
+from halfspace_sss.arrays import Library, Real, library
 
 LONGEST = 20.0  # transport mean free paths; caps the length scale where nothing absorbs
 U_MAX = 12.0  # beyond this u the learnt factor stays as it is there
 NEAR = 0.05  # mean free paths; bounds the near term at r = 0
 
 
-def length_scale(albedo: Any, g: Any) -> Any:
+def length_scale(albedo: Real, g: Real) -> Real:
     """L = 1 / sqrt(3 (1 - albedo) (1 - albedo g)), at most 20 transport mean free paths: the decay of diffusion."""
     lib = library(albedo, g)
     sigma_t_prime = 1 - albedo * g
@@ -27,24 +26,24 @@ def length_scale(albedo: Any, g: Any) -> Any:
     return float(L) if isinstance(L, np.floating) else L  # a NumPy scalar would widen float32 queries
 
 
-def warp(lib: Any, x: Any) -> Any:
+def warp(lib: Library, x: Real) -> Real:
     """u = log(exp(x) - 1) of x = r/L: logarithmic below one, linear above, without overflow."""
     small = lib.minimum(x, 30.0)
     return lib.where(x > 20, x, lib.log(lib.maximum(lib.expm1(small), 1e-30)))
 
 
-def unwarp(lib: Any, u: Any) -> Any:
+def unwarp(lib: Library, u: Real) -> Real:
     """x = log(1 + exp(u)), the inverse of `warp`."""
     return lib.where(u > 20, u, lib.log(1 + lib.exp(lib.minimum(u, 30.0))))
 
 
-def _boundary_A(eta: Any) -> Any:
+def _boundary_A(eta: Real) -> Real:
     """A of the extrapolation distance to 1 % on [1, 2], smooth in eta; a fit of `fresnel.boundary_A`."""
     x = eta - 1
     return 1 + x * (3.12364741 + x * (4.56955441 - 0.60924973 * x))
 
 
-def backbone(r: Any, albedo: Any, g: Any, eta: Any) -> Any:
+def backbone(r: Real, albedo: Real, g: Real, eta: Real) -> Real:
     """B(r) = albedo² b(r), b = sum_{r,v} z (1 + s d) exp(-s d)/d³ / (4 pi²) + ((1 - g)/sigma_t')² e(r) / (16 pi²).
 
     A dipole with Grosjean's diffusion constant D, s = sqrt((1 - albedo)/D), d² = r² + z², z_r = 1/sigma_t',
@@ -60,7 +59,7 @@ def backbone(r: Any, albedo: Any, g: Any, eta: Any) -> Any:
     return albedo * albedo * backbone_shape(r, albedo, g, eta)
 
 
-def backbone_shape(r: Any, albedo: Any, g: Any, eta: Any) -> Any:
+def backbone_shape(r: Real, albedo: Real, g: Real, eta: Real) -> Real:
     """b(r) of `backbone`, without albedo²: a product with it may leave the range of float32 on the way."""
     lib = library(r, albedo, g, eta)
     sigma_t_prime = 1 - albedo * g
@@ -74,7 +73,7 @@ def backbone_shape(r: Any, albedo: Any, g: Any, eta: Any) -> Any:
     return far / (4 * math.pi**2) + near * lib.exp(-r) / (r + NEAR)
 
 
-def _source(lib: Any, r: Any, z: Any, s: Any) -> Any:
+def _source(lib: Library, r: Real, z: Real, s: Real) -> Real:
     inverse = 1 / lib.sqrt(r * r + z * z)
     t = s / inverse
     return z * (1 + t) * lib.exp(-t) * inverse * inverse * inverse

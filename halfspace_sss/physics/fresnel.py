@@ -4,26 +4,25 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import Any
 
 import numpy as np
 
-from halfspace_sss.arrays import library
+from halfspace_sss.arrays import Real, library
 
 SMALLEST_SQUARE = 1e-24  # of a sine
 
 
-def _matched(eta: Any) -> bool:
+def _matched(eta: Real) -> bool:
     """Whether the index is the number 1, for which formulas shorten to exact ones; arrays are masked instead."""
     return isinstance(eta, (int, float)) and eta == 1
 
 
-def _m2(mu: Any, eta: Any) -> Any:
+def _m2(mu: Real, eta: Real) -> Real:
     """(eta mu_t)² = eta² - 1 + mu², which keeps its digits for eta -> 1 and mu -> 0."""
     return (eta - 1) * (eta + 1) + mu * mu
 
 
-def F_r(mu: Any, eta: Any) -> Any:
+def F_r(mu: Real, eta: Real) -> Real:
     """Unpolarised Fresnel reflectance of light that meets the surface at cosine mu.
 
     F = (r_s² + r_p²) / 2, r_s = (mu - m) / (mu + m), r_p = (eta² mu - m) / (eta² mu + m) with m = eta mu_t =
@@ -50,7 +49,7 @@ def F_r(mu: Any, eta: Any) -> Any:
     return F if isinstance(eta, (int, float)) else lib.where(eta == 1, 0 * mu, F)
 
 
-def F_t(mu: Any, eta: Any) -> Any:
+def F_t(mu: Real, eta: Real) -> Real:
     """Fresnel transmittance 1 - F_r, with the digits of T kept at grazing incidence.
 
     T = 2 eta mu mu_t [1 / (mu + eta mu_t)² + 1 / (eta mu + mu_t)²]. Same function for light entering
@@ -65,7 +64,7 @@ def F_t(mu: Any, eta: Any) -> Any:
     return T if isinstance(eta, (int, float)) else lib.where(eta == 1, 1 + 0 * mu, T)
 
 
-def mu_internal(mu: Any, eta: Any) -> Any:
+def mu_internal(mu: Real, eta: Real) -> Real:
     """Cosine inside for the cosine mu outside, sqrt(1 - (1 - mu²)/eta²); 0 where nothing refracts (eta < 1)."""
     lib = library(mu, eta)
     if _matched(eta):
@@ -74,13 +73,13 @@ def mu_internal(mu: Any, eta: Any) -> Any:
     return lib.where(result > 1, 1 + 0 * result, result)  # in float32 mu = 1 may give 1 + 1e-7
 
 
-def sine(mu: Any) -> Any:
+def sine(mu: Real) -> Real:
     """Sine of the angle with the cosine mu; 1e-12 at normal incidence, as a root has no derivative at 0."""
     lib = library(mu)
     return lib.sqrt(lib.maximum((1 - mu) * (1 + mu) + SMALLEST_SQUARE, 0.5 * SMALLEST_SQUARE))
 
 
-def mu_external(mu: Any, eta: Any) -> Any:
+def mu_external(mu: Real, eta: Real) -> Real:
     """Cosine outside for the cosine mu inside; 0 beyond the critical angle (eta > 1)."""
     return mu_internal(mu, 1 / eta)
 

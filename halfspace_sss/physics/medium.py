@@ -8,11 +8,11 @@ from __future__ import annotations
 import math
 import numbers
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from halfspace_sss.arrays import library
+from halfspace_sss.arrays import Real, library
 from halfspace_sss.physics.reflectance import DIFFUSE, albedo_of_reflectance, half_space_reflectance
 
 
@@ -320,13 +320,13 @@ class Medium:
         return hash(tuple(np.asarray(getattr(self, n)).tobytes() for n in ("sigma_s", "sigma_a", "g", "eta")))
 
 
-def _short(value: Any) -> str:
+def _short(value: float | np.ndarray) -> str:
     """To four digits; one number where all are the same."""
     results = [f"{x:.4g}" for x in np.atleast_1d(value).tolist()]
     return results[0] if len(set(results)) == 1 else " ".join(results)
 
 
-def check_scalar_medium(medium: Any) -> None:
+def check_scalar_medium(medium: object) -> None:
     if not isinstance(medium, Medium):
         raise ValueError(f"medium must be a Medium, got {type(medium).__name__}")
     if medium.n_channels is not None:
@@ -340,12 +340,12 @@ class HasMedium(Protocol):
     medium: Medium
 
 
-def medium_of(given: Any) -> Any:
+def medium_of(given: Medium | HasMedium) -> Medium:
     """The medium of a material; anything else as it is."""
     return given.medium if isinstance(given, HasMedium) else given
 
 
-def eval_hg(cos_theta: Any, g: Any) -> Any:
+def eval_hg(cos_theta: Real, g: Real) -> Real:
     """Henyey-Greenstein phase function p(cos_theta), 1/sr.
 
     p = (1 - g²) / (4 pi (1 + g² - 2 g cos_theta)^(3/2)), cos_theta = 1 forward. The bracket is
@@ -366,7 +366,7 @@ def eval_hg(cos_theta: Any, g: Any) -> Any:
     return (1 - size) * (1 + size) / (4 * math.pi * gap * lib.sqrt(gap))
 
 
-def sample_hg(u: Any, g: Any) -> Any:
+def sample_hg(u: Real, g: Real) -> Real:
     """Cosine of the scattering angle for a uniform number u in [0, 1).
 
     cos = 1 - (1 - g) (1 - u) (1 - g + q) / b with b = 1 - g + 2gu, q = (1 - g²) / b: the published

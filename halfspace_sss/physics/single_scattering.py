@@ -13,11 +13,12 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from halfspace_sss.arrays import broadcast_query, library
+from halfspace_sss.arrays import Library, Real, broadcast_query, library
 from halfspace_sss.checks import rounding
 from halfspace_sss.physics.fresnel import F_t, mu_external, mu_internal, sine
 from halfspace_sss.physics.medium import Medium, eval_hg
@@ -30,20 +31,20 @@ _NUMPY = library(0.0)
 class VertexSample(NamedTuple):
     """Distance s along the refracted exit ray (mm), depth of the vertex (mm), density of s (1/mm)."""
 
-    s: Any
-    depth: Any
-    pdf: Any
+    s: Real
+    depth: Real
+    pdf: Real
 
 
 class Contribution(NamedTuple):
     """f of `contribution` in 1/(mm sr), and x_i - x_o (mm) along and across the horizontal direction of exit."""
 
-    value: Any
-    x: Any
-    y: Any
+    value: Real
+    x: Real
+    y: Real
 
 
-def _arguments(medium: Medium, **args: Any) -> tuple[Any, Any]:
+def _arguments(medium: Medium, **args: Real) -> tuple[Library, Sequence[Real]]:
     """Broadcast arguments in one library, with a channel axis last if the medium has channels; refuses bad ranges."""
     lib, values = broadcast_query(*args.values())
     values = tuple(_checked(lib, name, value, given) for (name, given), value in zip(args.items(), values))
@@ -53,7 +54,7 @@ def _arguments(medium: Medium, **args: Any) -> tuple[Any, Any]:
     return lib, values
 
 
-def _checked(lib: Any, name: str, value: Any, given: Any) -> Any:
+def _checked(lib: Library, name: str, value: Real, given: Real) -> Real:
     """Cosines in [0, 1] up to rounding of what was given, distances >= 0, angles finite; Dr.Jit lanes as they are."""
     if type(value).__module__.startswith(("drjit", "mitsuba")) or 0 in value.shape:
         return value
@@ -65,12 +66,12 @@ def _checked(lib: Any, name: str, value: Any, given: Any) -> Any:
     return value
 
 
-def _sine(lib: Any, mu: Any, eta: float) -> Any:
+def _sine(lib: Library, mu: Real, eta: float) -> Real:
     """Sine of the refracted angle, sqrt(1 - mu²)/eta, at most 1."""
     return lib.minimum(sine(mu) / eta, 1.0)
 
 
-def _throughput(lib: Any, medium: Medium, mu_i: Any, mu_o: Any, delta_phi: Any) -> Any:
+def _throughput(lib: Library, medium: Medium, mu_i: Real, mu_o: Real, delta_phi: Real) -> Real:
     """T_12 T_21 p(c) / eta², what `brdf` and `contribution` share."""
     eta = medium.eta
     sines = _sine(lib, mu_i, eta) * _sine(lib, mu_o, eta)
@@ -79,7 +80,7 @@ def _throughput(lib: Any, medium: Medium, mu_i: Any, mu_o: Any, delta_phi: Any) 
     return F_t(mu_i, eta) * F_t(mu_o, eta) * p / eta**2
 
 
-def brdf(medium: Medium, mu_i: Any, mu_o: Any, delta_phi: Any) -> Any:
+def brdf(medium: Medium, mu_i: Real, mu_o: Real, delta_phi: Real) -> Real:
     """Single scattering under uniform irradiation of the plane, the BRDF in 1/sr.
 
     f = albedo T_12(mu_i) T_21(mu_o) p(c) / (eta² (mu_i' + mu_o')), reciprocal.
@@ -109,7 +110,7 @@ def _graded(n_low: int, n_high: int, n_nodes: int) -> tuple[np.ndarray, np.ndarr
     return np.concatenate([x, 1 - y]), np.concatenate([1 - x, y]), np.concatenate([w, v])
 
 
-def _mean_hg(g: Any, mu: Any, sine: Any, nu: Any, nu_sine: Any) -> tuple[Any, Any]:
+def _mean_hg(g: Real, mu: Real, sine: Real, nu: Real, nu_sine: Real) -> tuple[Real, Real]:
     """Means over azimuth of p(c) and p(c) cos(delta_phi) for c = -mu nu + sine nu_sine cos(delta_phi).
 
     1 + g² - 2 g c = A - B cos(delta_phi): with the complete elliptic integrals and m = 2B/(A + B), the integral of
@@ -157,7 +158,7 @@ def _exit_moments(medium: Medium, mu_i: np.ndarray) -> tuple[np.ndarray, np.ndar
     return tuple(enter * np.sum(common * v, axis=2) for v in (p, mean_x, mean_r2))
 
 
-def _cosines(medium: Medium, mu_i: Any) -> tuple[np.ndarray, np.ndarray | None]:
+def _cosines(medium: Medium, mu_i: Real) -> tuple[np.ndarray, np.ndarray | None]:
     """Cosines of incidence as an array, and for "diffuse" the weights 2 mu dmu of uniform radiance, else None."""
     if isinstance(mu_i, str):
         if mu_i != "diffuse":
@@ -167,7 +168,7 @@ def _cosines(medium: Medium, mu_i: Any) -> tuple[np.ndarray, np.ndarray | None]:
     return _checked(library(0.0), "mu_i", np.asarray(mu_i, dtype=np.float64), mu_i), None
 
 
-def reflectance(medium: Medium, mu_i: Any = 1.0) -> Any:
+def reflectance(medium: Medium, mu_i: Real = 1.0) -> Real:
     """Fraction of incident flux that leaves the medium after exactly one scattering event.
 
     R = albedo T_12 ∫_{mu_c}^1 mu / (mu + mu_i') T_21(mu) 2 pi p_mean(mu, mu_i') dmu over cosines inside; light that is
@@ -184,7 +185,7 @@ def reflectance(medium: Medium, mu_i: Any = 1.0) -> Any:
     return R if medium.n_channels is not None else R[..., 0][()]
 
 
-def moments(medium: Medium, mu_i: Any = 1.0) -> tuple[Any, Any]:
+def moments(medium: Medium, mu_i: Real = 1.0) -> tuple[Real, Real]:
     """⟨r²⟩ (mm²) and ⟨x⟩ (mm) of the flux that leaves after one scattering event, x along the light that enters.
 
     In mean free paths ⟨x⟩ = ⟨(nu sin_i + a sin_o cos)/(a + nu)⟩ and ⟨r²⟩ = 2 ⟨(nu² sin_i² + 2 a nu sin_i sin_o cos +
@@ -200,7 +201,7 @@ def moments(medium: Medium, mu_i: Any = 1.0) -> tuple[Any, Any]:
     return tuple(v if medium.n_channels is not None else v[..., 0][()] for v in result)
 
 
-def exitance(medium: Medium, r: Any, mu_i: Any = 1.0, phi: Any = 0.0) -> Any:
+def exitance(medium: Medium, r: Real, mu_i: Real = 1.0, phi: Real = 0.0) -> Real:
     """Exitance of the single order per flux of a pencil beam, 1/mm², at distance r and azimuth phi.
 
     M = T_12 ∫ sigma_s exp(-sigma_t (t + d)) p T_21 cos(theta) / d² dt over the refracted beam, d the distance from the
@@ -241,7 +242,7 @@ def exitance(medium: Medium, r: Any, mu_i: Any = 1.0, phi: Any = 0.0) -> Any:
     return lib.like(M, r_in)[()] if lib is _NUMPY else lib.like(M, r_in)
 
 
-def _critical_length(lib: Any, eta: float, mu_i: Any, foot: Any) -> Any:
+def _critical_length(lib: Library, eta: float, mu_i: Real, foot: Real) -> Real:
     """Beam length over r with total reflection, root of (mu_i/eta)² t² + 2 foot mu_c² t - mu_c² = 0; 0 if eta <= 1."""
     if eta <= 1:
         return 0.0 * mu_i * foot
@@ -251,7 +252,7 @@ def _critical_length(lib: Any, eta: float, mu_i: Any, foot: Any) -> Any:
     return lib.where(b > 0, mu_c2 / (root + lib.abs(b)), (root + lib.abs(b)) / (k * k))
 
 
-def sample_vertex(medium: Medium, mu_o: Any, u: Any) -> VertexSample:
+def sample_vertex(medium: Medium, mu_o: Real, u: Real) -> VertexSample:
     """Sample the scattering event on the refracted exit ray with density sigma_t exp(-sigma_t s); depth = s mu_o'.
 
     Args:
@@ -266,7 +267,7 @@ def sample_vertex(medium: Medium, mu_o: Any, u: Any) -> VertexSample:
     return VertexSample(s, s * mu_internal(mu_o, medium.eta), sigma_t * lib.exp(-sigma_t * s))
 
 
-def contribution(medium: Medium, s: Any, mu_i: Any, mu_o: Any, delta_phi: Any) -> Contribution:
+def contribution(medium: Medium, s: Real, mu_i: Real, mu_o: Real, delta_phi: Real) -> Contribution:
     """What light from w_i brings to (x_o, w_o) by scattering once at distance s on the refracted exit ray.
 
     L_o(x_o, w_o) = ∫_0^∞ ds ∫_2pi dw_i f(s, w_i, w_o) L_i(x_i(s, w_i), w_i), over outside directions, with

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,8 +25,8 @@ PATHS_PER_LANE, MAX_LANES = 64, 131072
 class Estimate(NamedTuple):
     """A Monte Carlo number (or array) and its standard error."""
 
-    value: Any
-    standard_error: Any
+    value: float | np.ndarray
+    standard_error: float | np.ndarray
 
 
 def estimate(samples: np.ndarray) -> Estimate:

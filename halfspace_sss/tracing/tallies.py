@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import math
 from types import ModuleType
-from typing import Any
 
 import numpy as np
 
+from halfspace_sss.arrays import Lanes
 from halfspace_sss.physics.fresnel import mu_internal
 from halfspace_sss.physics.medium import eval_hg
 from halfspace_sss.tracing.walk import Boundary, Scatter
@@ -20,7 +20,7 @@ FIXED_POINT = 2.0**32  # quantum 2.3e-10 of a unit weight; a cell holds up to 4e
 BATCHES = 64  # independent groups of lanes, from whose spread the variance of a cell is taken
 
 
-def _split(order: Any, value: Any) -> tuple[Any, Any]:
+def _split(order: Lanes, value: Lanes) -> tuple[Lanes, Lanes]:
     """A value as (single, multiple) according to the scattering order."""
     import drjit as dr
 
@@ -118,7 +118,7 @@ class CellSums:
         self.sums = dr.zeros(types.UInt64, cells * batches)
         dr.eval(self.sums)
 
-    def add(self, value: Any, cell: Any, lane: Any, active: Any) -> None:
+    def add(self, value: Lanes, cell: Lanes, lane: Lanes, active: Lanes) -> None:
         """Add value >= 0 to a cell of the batch of this lane."""
         import drjit as dr
 
@@ -199,7 +199,7 @@ class LineTally:
         return sums
 
 
-def find_cell(edges: Any, value: Any) -> tuple[Any, Any]:
+def find_cell(edges: Lanes, value: Lanes) -> tuple[Lanes, Lanes]:
     """Index of the interval of an ascending Dr.Jit table that holds the value, and whether one does."""
     import drjit as dr
 

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, overload
+from typing import overload
 
 import numpy as np
 
@@ -93,11 +93,11 @@ class Trace:
 
 
 @overload
-def trace(medium: Medium, *arguments: Any, **options: Any) -> Trace: ...
+def trace(medium: Medium, *arguments: object, **options: object) -> Trace: ...
 
 
 @overload
-def trace(medium: Layers, *arguments: Any, **options: Any) -> LayerTrace: ...
+def trace(medium: Layers, *arguments: object, **options: object) -> LayerTrace: ...
 
 
 def trace(

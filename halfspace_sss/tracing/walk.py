@@ -12,10 +12,11 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
+from halfspace_sss.arrays import Lanes
 from halfspace_sss.physics.fresnel import F_r
 from halfspace_sss.physics.medium import Medium, check_ratios, sample_hg
 
@@ -36,30 +37,30 @@ FIRST_TURNS, FEWEST_TURNS = 64, 16  # of the loop in a launch
 class Boundary:
     """A walk that meets the surface from below: what leaves there."""
 
-    order: Any  # scattering events so far; 0 cannot occur
-    weight: Any  # leaving weight w (1 - F_r), 0 where nothing leaves
-    x: Any
-    y: Any
-    mu: Any  # internal cosine
-    length: Any  # path length inside, mean free paths
-    lane: Any
+    order: Lanes  # scattering events so far; 0 cannot occur
+    weight: Lanes  # leaving weight w (1 - F_r), 0 where nothing leaves
+    x: Lanes
+    y: Lanes
+    mu: Lanes  # internal cosine
+    length: Lanes  # path length inside, mean free paths
+    lane: Lanes
 
 
 @dataclass
 class Scatter:
     """A scattering event, before the new direction is drawn."""
 
-    order: Any  # this event's number, from 1
-    weight: Any  # weight after the event (albedo included)
-    x: Any
-    y: Any
-    z: Any
-    dx: Any  # direction of arrival; dz > 0 points down
-    dy: Any
-    dz: Any
-    lane: Any
-    first: Any  # cosine of the first scattering angle; 1 before it is drawn
-    random: Any  # further uniform numbers: call it
+    order: Lanes  # this event's number, from 1
+    weight: Lanes  # weight after the event (albedo included)
+    x: Lanes
+    y: Lanes
+    z: Lanes
+    dx: Lanes  # direction of arrival; dz > 0 points down
+    dy: Lanes
+    dz: Lanes
+    lane: Lanes
+    first: Lanes  # cosine of the first scattering angle; 1 before it is drawn
+    random: Callable[[], Lanes]  # further uniform numbers
 
 
 class Tally(Protocol):
@@ -82,9 +83,9 @@ class WalkConstants:
     Numbers are opaque, so that one kernel serves all media; isotropic and matched media have kernels of their own.
     """
 
-    albedo: Any
-    g: Any
-    inverse_eta: Any
+    albedo: Lanes
+    g: Lanes
+    inverse_eta: Lanes
     isotropic: bool  # g = 0 in every lane
     matched: bool  # eta = 1 in every lane
 
@@ -129,7 +130,7 @@ def pass_seed(seed: int, *indices: int) -> tuple[int, int]:
     return int(state), int(stream >> np.uint64(1))
 
 
-def generator(types: ModuleType, lanes: int, seed: tuple[int, int]) -> Any:
+def generator(types: ModuleType, lanes: int, seed: tuple[int, int]) -> Lanes:
     """A generator whose lanes are independent: state and stream of each are hashed (SplitMix64).
 
     Lanes of PCG32 whose states and streams differ in a few low bits only are correlated: the variance of the mean of
@@ -144,7 +145,7 @@ def generator(types: ModuleType, lanes: int, seed: tuple[int, int]) -> Any:
     UInt64 = types.UInt64
     lane = dr.arange(UInt64, lanes)
 
-    def hashed(start: int) -> Any:
+    def hashed(start: int) -> Lanes:
         z = dr.opaque(UInt64, start) + lane * UInt64(0x9E3779B97F4A7C15)
         z = (z ^ (z >> 30)) * UInt64(0xBF58476D1CE4E5B9)
         z = (z ^ (z >> 27)) * UInt64(0x94D049BB133111EB)
@@ -153,7 +154,7 @@ def generator(types: ModuleType, lanes: int, seed: tuple[int, int]) -> Any:
     return types.PCG32(lanes, *map(hashed, seed))
 
 
-def turn(dx: Any, dy: Any, dz: Any, cosine: Any, azimuth: Any) -> tuple[Any, Any, Any]:
+def turn(dx: Lanes, dy: Lanes, dz: Lanes, cosine: Lanes, azimuth: Lanes) -> tuple[Lanes, Lanes, Lanes]:
     """Direction at the given polar cosine and azimuth about (dx, dy, dz); frame of Duff et al. 2017."""
     import drjit as dr
 
@@ -170,7 +171,7 @@ def turn(dx: Any, dy: Any, dz: Any, cosine: Any, azimuth: Any) -> tuple[Any, Any
     return nx * shrink, ny * shrink, nz * shrink
 
 
-def in_launches(state: tuple, going: Callable[..., Any], body: Callable[..., tuple], label: str) -> tuple:
+def in_launches(state: tuple, going: Callable[..., Lanes], body: Callable[..., tuple], label: str) -> tuple:
     """A symbolic loop in launches of about `LAUNCH_SECONDS`; lanes go on where they were, to the last bit.
 
     Args:
@@ -183,7 +184,7 @@ def in_launches(state: tuple, going: Callable[..., Any], body: Callable[..., tup
 
     UInt32 = dr.uint32_array_t(type(going(*state)))
 
-    def launch(state: tuple, most: Any) -> tuple:
+    def launch(state: tuple, most: Lanes) -> tuple:
         loop = (UInt32(0), *state)
         loop = dr.while_loop(
             loop, lambda k, *s: going(*s) & (k < most), lambda k, *s: (k + 1, *body(*s)), mode="symbolic", label=label
@@ -204,12 +205,12 @@ def in_launches(state: tuple, going: Callable[..., Any], body: Callable[..., tup
 def walk(
     types: ModuleType,
     medium: Medium | WalkConstants,
-    mu_in: Any,
+    mu_in: Lanes,
     paths_per_lane: int,
     seed: tuple[int, int],
     tallies: Sequence[Tally],
-    weight: Any = 1.0,
-) -> tuple[tuple, Any]:
+    weight: Lanes = 1.0,
+) -> tuple[tuple, Lanes]:
     """Trace `paths_per_lane` walks one after another in each lane and return the tallies' sums and event counts.
 
     A lane that ends a walk starts the next at once, so that lanes stay busy although walks differ in length.
@@ -259,7 +260,7 @@ def walk(
     return sums, s["events"]
 
 
-def roulette(weight: Any, order: Any) -> tuple[Any, Any]:
+def roulette(weight: Lanes, order: Lanes) -> tuple[Lanes, Lanes]:
     """Probability that a walk goes on, and its weight if it does."""
     import drjit as dr
 
@@ -274,7 +275,7 @@ def roulette(weight: Any, order: Any) -> tuple[Any, Any]:
     return survive, weight
 
 
-def _step(s: dict, sums: tuple, m: WalkConstants, start: tuple, lane: Any, tallies: Sequence[Tally]) -> tuple:
+def _step(s: dict, sums: tuple, m: WalkConstants, start: tuple, lane: Lanes, tallies: Sequence[Tally]) -> tuple:
     """One free path, the boundary if it is met, one scattering event, roulette; ended walks begin anew."""
     import drjit as dr
 
@@ -309,7 +310,7 @@ def _step(s: dict, sums: tuple, m: WalkConstants, start: tuple, lane: Any, talli
     survive, weight = roulette(weight, order)
     ends = rng.next_float32() >= survive
 
-    def renew(begin: Any, value: Any) -> Any:
+    def renew(begin: Lanes, value: Lanes) -> Lanes:
         return dr.select(ends, begin, value)
 
     return {

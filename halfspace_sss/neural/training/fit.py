@@ -8,11 +8,11 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 
@@ -143,15 +143,16 @@ class CpuSchedule:
 
 BETAS, CLIP = (0.9, 0.99), 1.0
 ADAM = (0.9, 0.999)  # the betas of Kingma and Ba 2015, which published networks are fitted with
-Source = Callable[[torch.Generator], Any]  # the next batch; all chance in it is drawn from the generator
+Batch = object  # what a source gives and its learner takes
+Source = Callable[[torch.Generator], Batch]  # the next batch; all chance in it is drawn from the generator
 
 
 class Learnable(Protocol):
     """A torch module that knows its loss for a batch of its source."""
 
-    def parameters(self) -> Any: ...
+    def parameters(self) -> Iterable[torch.nn.Parameter]: ...
 
-    def loss(self, batch: Any) -> torch.Tensor: ...
+    def loss(self, batch: Batch) -> torch.Tensor: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,9 +160,9 @@ class Objective:
     """A module as a learner, with its loss for a batch."""
 
     module: torch.nn.Module
-    loss: Callable[[Any], torch.Tensor]
+    loss: Callable[[Batch], torch.Tensor]
 
-    def parameters(self) -> Any:
+    def parameters(self) -> Iterable[torch.nn.Parameter]:
         return self.module.parameters()
 
 
@@ -193,7 +194,7 @@ class Descent:
 
     def __init__(
         self,
-        learner: Any,
+        learner: Learnable,
         *,
         betas: tuple[float, float] = BETAS,
         clip: float = CLIP,
@@ -297,7 +298,7 @@ def fit(
 class _FitState:
     """The numbers, Adam's moments, the generator, the history."""
 
-    def __init__(self, learner: Any, schedule: Schedule, seed: int, descent: Descent) -> None:
+    def __init__(self, learner: Learnable, schedule: Schedule, seed: int, descent: Descent) -> None:
         self.learner, self.schedule, self.descent = learner, schedule, descent
         self.generator = torch.Generator().manual_seed(seed)
         self.loss, self.done = math.nan, False

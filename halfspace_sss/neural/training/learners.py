@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import torch
@@ -137,7 +136,7 @@ class Hyper(nn.Module):
         log_factor = apply_networks(batch.features(), torch.addmm(self.base, c, self.basis), self.shapes)
         return relative_loss(torch.exp(log_factor.clamp(-LOG_RANGE, LOG_RANGE)), batch)
 
-    def parameters_as_arrays(self) -> dict[str, Any]:
+    def parameters_as_arrays(self) -> dict[str, np.ndarray]:
         """Arrays for the file of weights, in half precision."""
         layers = {}
         for k, (W, b) in enumerate(zip(self.matrices, self.biases)):

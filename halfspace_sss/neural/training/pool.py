@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
 
+from halfspace_sss.arrays import Library, library
 from halfspace_sss.maps.noisy_maps import CellGrid, Groups, backbone_mass, radial_edges
 from halfspace_sss.neural.features import medium_features, symmetric_features
 from halfspace_sss.physics.backbone import length_scale, unwarp
@@ -47,10 +47,8 @@ def _ray(mu: torch.Tensor, azimuth: torch.Tensor) -> tuple[torch.Tensor, ...]:
     return sine * torch.cos(azimuth), sine * torch.sin(azimuth), mu
 
 
-def torch_library() -> Any:
+def torch_library() -> Library:
     """The array library of torch."""
-    from halfspace_sss.arrays import library
-
     return library(torch.empty(0))
 
 
@@ -120,7 +118,7 @@ class MapPool:
         )  # fmt: skip
 
 
-def _float(values: Any) -> torch.Tensor:
+def _float(values: np.ndarray) -> torch.Tensor:
     return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
 
 

@@ -7,9 +7,10 @@ import os
 import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
+import torch
 
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_choice, check_count, check_interval
@@ -30,7 +31,7 @@ from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
 from halfspace_sss.neural.universal import load_hypernetwork, shipped_weights
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
-from halfspace_sss.provenance import check_folder, path_of, provenance
+from halfspace_sss.provenance import JsonDict, check_folder, path_of, provenance
 
 VALIDATION_SEED = 104729
 VALIDATION_SETS = 4  # of 8 directions
@@ -78,18 +79,21 @@ class TrainedChannel:
     fit_seconds: float
 
 
+Trainee = Small | PaperLearner  # torch modules with `loss`, `network`, `width` and `depth`
+
+
 class ModelTraining(Protocol):
     """What is trained: a kind of model, with its learner and how the learner answers as a model."""
 
     kind: str
 
-    def learner(self, medium: Medium, pool: MapPool, seed: int) -> Any:
-        """A torch module with `loss`, `network`, `width` and `depth`."""
+    def learner(self, medium: Medium, pool: MapPool, seed: int) -> Trainee:
+        """What is fitted to the maps of a medium."""
 
-    def model(self, medium: Medium, learner: Any) -> BSSRDF:
+    def model(self, medium: Medium, learner: Trainee) -> BSSRDF:
         """The learner as it is, as a model."""
 
-    def record(self, learner: Any) -> dict[str, Any]:
+    def record(self, learner: Trainee) -> JsonDict:
         """What must be known beside the network to load it."""
 
 
@@ -164,8 +168,9 @@ def _groups(medium: Medium, n: int, rng: np.random.Generator) -> Groups:
 
 
 def _record(
-    medium: Medium, recipe: Any, seed: int, error: ModelError, history: list, data_seconds: float, fit_seconds: float
-) -> dict[str, Any]:
+    medium: Medium, recipe: MaterialRecipe, seed: int, error: ModelError, history: list, data_seconds: float,
+    fit_seconds: float,
+) -> JsonDict:  # fmt: skip
     """What the JSON beside the weights tells; errors of the history are upper ends, see `NoiseFree.bound`."""
     plain = {k: v if isinstance(v, dict) else float(v) for k, v in error._asdict().items()}
     plain |= {"standard_error": error.known.standard_error, "bound": error.known.bound}
@@ -214,7 +219,7 @@ class MaterialTraining:
     def model(self, medium: Medium, learner: Small) -> Trial:
         return Trial(medium, learner.network())
 
-    def record(self, learner: Small) -> dict[str, Any]:
+    def record(self, learner: Small) -> JsonDict:
         return {"warm_start": self.warm}
 
 
@@ -225,21 +230,15 @@ class PaperTraining:
 
     def learner(self, medium: Medium, pool: MapPool, seed: int) -> PaperLearner:
         probe = PaperLearner(medium, 1.0, width=1)
-        batch = pool.batch(64, 1024, _generator())
+        batch = pool.batch(64, 1024, torch.Generator().manual_seed(0))
         S = probe.S_over_y(batch)[:, : batch.y.shape[1]] * batch.y
         return PaperLearner(medium, max(math.sqrt(float((S**2).mean())), 1e-20), seed=seed)
 
     def model(self, medium: Medium, learner: PaperLearner) -> NeuralPaper:
         return NeuralPaper(medium, [(learner.network(), learner.scale)])
 
-    def record(self, learner: PaperLearner) -> dict[str, Any]:
+    def record(self, learner: PaperLearner) -> JsonDict:
         return {"scale": learner.scale}
-
-
-def _generator() -> Any:
-    import torch
-
-    return torch.Generator().manual_seed(0)
 
 
 TRAININGS = {"neural_material": MaterialTraining(), "neural_paper": PaperTraining()}

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -45,7 +45,7 @@ from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.backbone import length_scale
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
-from halfspace_sss.provenance import check_folder, provenance, write_atomically
+from halfspace_sss.provenance import JsonDict, check_folder, provenance, write_atomically
 
 INTERVALS = 16  # of the cosine of exit
 COSINES = 2  # of incidence, of each medium
@@ -255,7 +255,7 @@ def train_universal(
     hyper = hypernetwork_of(arrays, learner.width, learner.depth)
     known = collect(hyper, recipe.calibration_media, seed, folder, progress)
     arrays |= named_layers(CALIBRATION, calibrated(known, recipe.calibration_how, seed))
-    record: dict[str, Any] = {
+    record: JsonDict = {
         "width": learner.width, "depth": learner.depth, "ranges": {k: list(v) for k, v in RANGES.items()}, "seed": seed,
         "recipe": asdict(recipe), "data_seconds": data_seconds, "seconds": time.monotonic() - started,
         "history": history, "provenance": provenance(seed=seed),

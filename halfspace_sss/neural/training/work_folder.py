@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import halfspace_sss
 from halfspace_sss.neural.store import to_json
-from halfspace_sss.provenance import read_text, write_atomically
+from halfspace_sss.provenance import JsonDict, read_text, write_atomically
 
 RUN, CHECKPOINT = "run.json", "checkpoint.safetensors"
 WORK = ("maps-*.npy", "reflectances-*.npy", CHECKPOINT)
 
 
-def claim(folder: Path, **run: Any) -> None:
+def claim(folder: Path, **run: object) -> None:
     """Write in `folder` which run it belongs to; where that is written already, check that it is the same.
 
     Args:
@@ -41,7 +40,7 @@ def claim(folder: Path, **run: Any) -> None:
             )
 
 
-def _read(place: Path) -> dict[str, Any]:
+def _read(place: Path) -> JsonDict:
     try:
         run = json.loads(read_text(place))
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
@@ -51,7 +50,7 @@ def _read(place: Path) -> dict[str, Any]:
     return run
 
 
-def _flat(tree: dict[str, Any]) -> dict[str, Any]:
+def _flat(tree: JsonDict) -> JsonDict:
     """Leaves by their path, {"recipe.how.steps": 100}."""
     leaves = {}
     for key, value in tree.items():
