@@ -9,14 +9,14 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
 from torch import nn
 
 from benchmarks.budgets import Budget, Samples, Seconds, Within
-from halfspace_sss.arrays import library
+from halfspace_sss.arrays import Real, library
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count
 from halfspace_sss.comparison.model_errors import ReferenceSize, TracedMaps, model_error, reference_maps
@@ -118,7 +118,7 @@ class PlainTrial(BSSRDF):
         super().__init__(medium)
         self.network, self.scale = network, scale
 
-    def G(self, q: Query) -> Any:
+    def G(self, q: Query) -> Real:
         lib, m = q.lib, self.medium
         log_factor = self.network(query_inputs(q, length_scale(m.albedo, m.g)))
         factor = lib.exp(lib.minimum(lib.maximum(log_factor, -LOG_RANGE), LOG_RANGE))
@@ -127,7 +127,7 @@ class PlainTrial(BSSRDF):
         return self.scale * factor / lib.maximum(F_t(q.mu_i, m.eta) * F_t(q.mu_o, m.eta), T_SMALLEST)
 
 
-def model_of(learner: Any, medium: Medium) -> BSSRDF:
+def model_of(learner: torch.nn.Module, medium: Medium) -> BSSRDF:
     """A learner of this table as it is, as a model of its medium."""
     network = learner.network()
     if isinstance(learner, PaperLearner):
@@ -172,7 +172,7 @@ class Variant:
     warm: bool = False
     by_area: bool = False
 
-    def learner(self, medium: Medium, pool: MapPool, seed: int) -> Any:
+    def learner(self, medium: Medium, pool: MapPool, seed: int) -> torch.nn.Module:
         """A torch module with `loss` and `network`."""
         paper = SharedTurn(medium, PaperTraining().learner(medium, pool, seed).scale, seed=seed)
         if self.learned == "S":

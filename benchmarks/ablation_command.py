@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from halfspace_sss.backend import array_types
 from halfspace_sss.cli.shared import Backend, Bar, MediumOptions, OutFolder, Places, console, whole
 from halfspace_sss.kept_rows import KeptRows
-from halfspace_sss.provenance import check_folder, provenance, write_together
+from halfspace_sss.provenance import JsonDict, check_folder, provenance, write_together
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -100,7 +100,7 @@ def _budgets(seconds: float | None, samples: int | None) -> Sequence[Budget]:
 def _write(out: Path, table: pandas.DataFrame, summary: pandas.DataFrame, caption: str, how: dict) -> list[Path]:
     from halfspace_sss.comparison.bench import machine
 
-    content: dict[str, Any] = {"provenance": provenance(**how), "machine": machine(), "caption": caption}
+    content: JsonDict = {"provenance": provenance(**how), "machine": machine(), "caption": caption}
     content["summary"] = json.loads(summary.to_json(orient="records"))
     files = {
         "ablation.csv": table.to_csv(index=False, lineterminator="\n"),
@@ -125,7 +125,7 @@ def _rich(title: str, summary: pandas.DataFrame) -> Table:
     return table
 
 
-def _percent(row: dict[str, Any], key: str) -> str:
+def _percent(row: JsonDict, key: str) -> str:
     spread = row[f"{key}_sd"]
     return _number(row[key]) if spread != spread else f"{_number(row[key])} ± {_number(spread)}"
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -28,6 +28,7 @@ from full_geometry.objects.objects import TranslucentObject
 from full_geometry.transport.features import Side, first_event, n_side, side_features
 from full_geometry.transport.patches import Patches, PatchSampler, PatchWeights, cluster
 from full_geometry.transport.storing import frame_of
+from halfspace_sss.arrays import Lanes
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.neural.training.fit import Objective, fit
 
@@ -38,8 +39,8 @@ class PreparedAlphaP(NamedTuple):
     """Of an exit: its side and features, alpha, and the weights of patches."""
 
     side: Side
-    features: list[Any]
-    alpha: Any
+    features: list[Lanes]
+    alpha: Lanes
     weights: PatchWeights
 
 
@@ -60,7 +61,7 @@ class AlphaP:
     scale: tuple[float, ...]
     orders = "multiple"
 
-    def _face(self, at: SurfacePoint, active: Any) -> tuple[Any, Any]:
+    def _face(self, at: SurfacePoint, active: Lanes) -> tuple[Lanes, Lanes]:
         """The face that a point lies on, as a short ray from outside meets it, and where there is one."""
         clear = opaque(CLEAR * self.object.geometry.size)
         ray = mi.Ray3f(mi.Point3f(at.p + at.n * clear), mi.Vector3f(-at.n))
@@ -76,14 +77,14 @@ class AlphaP:
     def _shares(self) -> Perceptron:
         return Perceptron.named(self.weights, "P", "p", looped=True)
 
-    def prepare(self, at: SurfacePoint, active: Any = True) -> PreparedAlphaP:
+    def prepare(self, at: SurfacePoint, active: Lanes = True) -> PreparedAlphaP:
         """alpha and the weights of patches of an exit."""
         side = Side(at, first_event(self.object, at, active))
         features = side_features(self.sampler.frame, side)
         alpha = dr.exp(self._log_alpha(features)[0])
         return PreparedAlphaP(side, features, alpha, self.sampler.patches.prepare(side))
 
-    def S(self, exit: PreparedAlphaP, at: SurfacePoint, active: Any = True, face: Any = None) -> Any:
+    def S(self, exit: PreparedAlphaP, at: SurfacePoint, active: Lanes = True, face: Lanes = None) -> Lanes:
         """S(x_i, w_i; x_o, w_o) per channel, 1/((scene unit)² sr); 0 below the horizons.
 
         Args:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -38,11 +38,15 @@ from figures.computing.scenes import BUNNY, MATERIALS, SCANS, prepare
 from figures.computing.timed import TimedRender, alternating, rendered
 from figures.modelling.objects import TISSUES, VARYING, tissue
 from figures.parts.part import Part, Result, Task, unmodelled
+from figures.parts.records import Params, SceneDict
 from halfspace_sss import materials
 from halfspace_sss.backend import kernel_seconds
 from halfspace_sss.checks import check_choice
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 MODELLED = ("candle", "mandarin")
 LIGHTS = ("small light", "even sky")
@@ -52,7 +56,7 @@ GLOW = (90.0, 84.0, 75.0)
 
 def modelled_scene(
     name: str, resolution: int, size: int, lights: str, folder: Path, sampler: str = "independent", seed: int = 0
-) -> dict[str, Any]:
+) -> SceneDict:
     """A modelled object on its own, as a dict for `scene_files.load_scene`, under its name.
 
     Args:
@@ -87,7 +91,9 @@ def modelled_scene(
     }  # fmt: skip
 
 
-def modelled_contender(method: str, p: Mapping[str, Any], folder: Path, sampler: str = "independent") -> Any:
+def modelled_contender(
+    method: str, p: Params, folder: Path, sampler: str = "independent"
+) -> mi.Scene | tuple[mi.Scene, ...]:
     """The scene of a modelled object for a method, see `contenders.ready`.
 
     Args:
@@ -101,7 +107,7 @@ def modelled_contender(method: str, p: Mapping[str, Any], folder: Path, sampler:
 
 
 @unmodelled
-def long_modelled(task: Task) -> dict[str, Any]:
+def long_modelled(task: Task) -> dict[str, object]:
     """A long image by our walk, for the parameters of `modelled_contender` and "spp" and "seed"."""
     prepare()
     return long_passes(task, modelled_contender(WALK, task.params, task.folder))
@@ -192,7 +198,7 @@ def _parts_of(name: str, lights: str, quality: str) -> list[Part]:
     ]
 
 
-def _subject(name: str, quality: str) -> tuple[dict[str, Any], Path, Medium]:
+def _subject(name: str, quality: str) -> tuple[dict[str, int | str], Path, Medium]:
     """What of the parameters of its parts tells an object, the file that it depends on, and its medium."""
     if name in OBJECTS:
         return {"object": name, "resolution": RESOLUTION[quality]}, TISSUES, tissue("candle wax").medium
@@ -200,7 +206,7 @@ def _subject(name: str, quality: str) -> tuple[dict[str, Any], Path, Medium]:
     return {"scan": scan, "material": material}, SCANS[scan].file, materials.load(material).medium
 
 
-def measured(task: Task) -> dict[str, Any]:
+def measured(task: Task) -> dict[str, object]:
     """Errors and CPU seconds of all methods, whose passes take turns, and those of training."""
     prepare()
     p = task.params
@@ -222,7 +228,7 @@ def measured(task: Task) -> dict[str, Any]:
     return {"rows": rows, "truth": about, "training": dict(zip([FULL_GEOMETRY], seconds))}
 
 
-def _compiled(task: Task) -> dict[str, Any]:
+def _compiled(task: Task) -> dict[str, mi.Scene]:
     """The scenes of all methods, with their kernels: the walk and the sampler have one for each number of samples."""
     p, scenes = task.params, {}
     for k, (name, spp) in enumerate(p["spp"].items()):
@@ -279,7 +285,7 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
     scenes = {(name, lights): _errors_name(name, lights) for name in (*SUBJECTS, *OBJECTS) for lights in LIGHTS}
     furnaces = {method: _furnace_name(method) for method in (WALK, *furnace_models())}
 
-    def numbers(names: Mapping[Any, str]) -> dict[Any, Mapping[str, Any]]:
+    def numbers(names: Mapping[tuple[str, str] | str, str]) -> dict[tuple[str, str] | str, Params]:
         return {key: results[name].numbers for key, name in names.items() if name in results}
 
     tables = {
@@ -305,7 +311,7 @@ def furnace_models() -> list[str]:
     return accepting(Medium.from_albedo(ALBEDO, 1.0, 0.0, ETA))
 
 
-def furnace_scene(model: str, size: int, radius: float = RADIUS) -> Any:
+def furnace_scene(model: str, size: int, radius: float = RADIUS) -> mi.Scene:
     """The Mitsuba scene of the furnace: the middle of the sphere fills the image.
 
     Args:
@@ -331,7 +337,7 @@ def furnace_scene(model: str, size: int, radius: float = RADIUS) -> Any:
     return load_scene(scene, PATH_TRACED if model == WALK else model)
 
 
-def furnace(task: Task) -> dict[str, Any]:
+def furnace(task: Task) -> dict[str, object]:
     """Mean radiance of the sphere and its standard error."""
     import mitsuba as mi
 
@@ -346,7 +352,7 @@ def furnace(task: Task) -> dict[str, Any]:
 STEPS = ("entries", "visibility", "evaluation")
 
 
-def split(task: Task) -> dict[str, Any]:
+def split(task: Task) -> dict[str, object]:
     """Seconds per million samples of each step and model, each step as a kernel of its own over the same lanes.
 
     The models take turns; of the repeats the fastest counts, which is the one that nothing else delayed.
@@ -367,7 +373,7 @@ def split(task: Task) -> dict[str, Any]:
     }
 
 
-def _steps(scene: Any, n: int) -> dict[str, Callable[[], Any]]:
+def _steps(scene: mi.Scene, n: int) -> dict[str, Callable[[], object]]:
     """For each step what it computes, from inputs that are in memory."""
     import drjit as dr
     import mitsuba as mi
@@ -390,7 +396,7 @@ def _steps(scene: Any, n: int) -> dict[str, Callable[[], Any]]:
     result = entry.weight > 0
     dr.eval(result)
 
-    def evaluated() -> Any:
+    def evaluated() -> mi.Spectrum:
         at = entry.facing(direction)
         return obj.transport.S(prepared, at, result) * at.mu
 
@@ -401,7 +407,7 @@ def _steps(scene: Any, n: int) -> dict[str, Callable[[], Any]]:
     }
 
 
-def _seen(scene: Any, n: int) -> Any:
+def _seen(scene: mi.Scene, n: int) -> mi.SurfaceInteraction3f:
     """Points of the object where n rays of the camera meet it."""
     import drjit as dr
     import mitsuba as mi

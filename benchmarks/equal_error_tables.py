@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from figures.computing.contenders import VOLUMES, WALK, volume
 from figures.drawing.labels import in_markdown, label
+from figures.parts.records import Params, Row
 from halfspace_sss.comparison.style import look
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ The models without surface reflection and without the single scattering that the
 best setting and at rr_depth 200."""
 
 
-def equal_error(scenes: Mapping[tuple[str, str], Mapping[str, Any]]) -> pandas.DataFrame:
+def equal_error(scenes: Mapping[tuple[str, str], Params]) -> pandas.DataFrame:
     """A row for each scene and method.
 
     Args:
@@ -52,7 +53,7 @@ def equal_error(scenes: Mapping[tuple[str, str], Mapping[str, Any]]) -> pandas.D
     return pandas.DataFrame([row for scene, each in scenes.items() for row in _scene_rows(scene, each)])
 
 
-def _scene_rows(scene: tuple[str, str], values: Mapping[str, Any]) -> list[dict[str, Any]]:
+def _scene_rows(scene: tuple[str, str], values: Params) -> list[Row]:
     costs = _costs(values["rows"])
     best = min((name for name in VOLUMES if costs.get(name, 0.0) > 0), key=lambda name: costs[name], default=None)
     best_cost, level, rows = costs.get(best, np.nan), values["truth"]["mean square"], []
@@ -79,14 +80,14 @@ def _scene_rows(scene: tuple[str, str], values: Mapping[str, Any]) -> list[dict[
     return rows
 
 
-def _until_paid(name: str, values: Mapping[str, Any], cost: float, best: float) -> float:
+def _until_paid(name: str, values: Params, cost: float, best: float) -> float:
     """Images of noise `WANTED` after which training and renders took less time than `volpathmis`; NaN if never."""
     training = values.get("training", {}).get(name, np.nan)
     saved = (best - cost) / (WANTED**2 * values["truth"]["mean square"])
     return float(np.ceil(training / saved)) if saved > 0 and np.isfinite(training) else np.nan
 
 
-def _costs(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+def _costs(rows: Sequence[Params]) -> dict[str, float]:
     """Variance times seconds by method; of volpathmis no variance is below that of a later roulette."""
     of_a_sample, results = {row["method"]: row["variance"] * row["spp"] for row in rows}, {}
     for row in rows:
@@ -97,7 +98,7 @@ def _costs(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     return results
 
 
-def _certain(row: Mapping[str, Any], key: str) -> float:
+def _certain(row: Params, key: str) -> float:
     """A number of a row, NaN where the noise of the truth hides it."""
     return row[key] if row[key] > CERTAIN * row[f"{key} standard error"] else np.nan
 
@@ -106,7 +107,7 @@ def _ratio(above: float, below: float) -> float:
     return above / below if below > 0 else np.nan
 
 
-def sampling(rows: Sequence[Mapping[str, Any]]) -> pandas.DataFrame:
+def sampling(rows: Sequence[Params]) -> pandas.DataFrame:
     """Seconds per million samples, with their sum."""
     import pandas
 

@@ -6,7 +6,7 @@ import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -17,6 +17,7 @@ from full_geometry.geometry.points import CosineProposals, EntrySample, Point, S
 from full_geometry.objects.objects import TranslucentObject
 from full_geometry.transport.features import ObjectFrame, PreparedExit, Side
 from full_geometry.transport.patches import Patches, PatchSampler, PatchTable, PatchWeights, mesh_faces
+from halfspace_sss.arrays import Lanes
 from halfspace_sss.neural.perceptron import Perceptron, relu
 
 # ---- The square [0, 1)² laid onto each patch of a surface, so that equal areas stay equal ----------
@@ -33,9 +34,9 @@ INSIDE = 1.0 - 2.0**-20  # largest coordinate
 class PatchFrame(NamedTuple):
     """Centre, two axes and normal of a patch, and its radius: sqrt of its area over pi. Scene units."""
 
-    centre: Any
-    axes: tuple[Any, Any, Any]
-    radius: Any
+    centre: Lanes
+    axes: tuple[Lanes, Lanes, Lanes]
+    radius: Lanes
 
 
 class Chart:
@@ -70,16 +71,16 @@ class Chart:
         dr.eval(self.tables)
         self.n_faces, self.n_strips = len(order), len(strips.first)
 
-    def _row(self, key: str, k: Any) -> Any:
+    def _row(self, key: str, k: Lanes) -> Lanes:
         return dr.gather(type(self.tables[key]), self.tables[key], k)
 
-    def frame(self, patch: Any) -> PatchFrame:
+    def frame(self, patch: Lanes) -> PatchFrame:
         """The frame of a patch."""
         v = [self._row("frames", patch * 13 + k) for k in range(13)]
         axes = tuple(mi.Vector3f(*v[k : k + 3]) for k in (3, 6, 9))
         return PatchFrame(mi.Point3f(*v[:3]), axes, v[12])
 
-    def point(self, patch: Any, u: tuple[Any, Any]) -> Point:
+    def point(self, patch: Lanes, u: tuple[Lanes, Lanes]) -> Point:
         """The point of a patch with coordinates u."""
         first, end = self._row("strips", patch), self._row("strips", patch + 1)
         strip = self._last_below("low_1", first, end, u[0], self.n_strips)
@@ -90,7 +91,7 @@ class Chart:
              (u[1] - self._row("low_2", face)) / self._row("size_2", face))  # fmt: skip
         return self.object.points.on_face(face, mi.Point2f(*(dr.clip(x, 0, INSIDE) for x in v)))
 
-    def coordinates(self, face: Any, p: Any) -> tuple[Any, Any]:
+    def coordinates(self, face: Lanes, p: Lanes) -> tuple[Lanes, Lanes]:
         """Coordinates in its patch of a point of a face."""
         a, b, c = positions_at(self.object.geometry.shape, vertices_of(self.object.geometry.shape, face))
         ab, ac, ap = b - a, c - a, p - a
@@ -104,10 +105,10 @@ class Chart:
              self._row("low_2", face) + self._row("size_2", face) * dr.clip(v.y, 0, INSIDE))  # fmt: skip
         return tuple(dr.clip(x, 0, INSIDE) for x in u)
 
-    def _last_below(self, key: str, first: Any, end: Any, u: Any, n: int) -> Any:
+    def _last_below(self, key: str, first: Lanes, end: Lanes, u: Lanes, n: int) -> Lanes:
         """The last of the entries first ... end - 1 of a table that rises that is not above u."""
 
-        def before(i: Any) -> Any:
+        def before(i: Lanes) -> Lanes:
             i = mi.UInt32(i)
             return (i < first) | ((i + 1 < end) & (self._row(key, dr.minimum(i + 1, n - 1)) <= u))
 
@@ -190,17 +191,17 @@ def _within(order: np.ndarray, of_face: np.ndarray, areas: np.ndarray, n: int) -
 N_CONTEXT = 18
 
 
-def context(frame: ObjectFrame, exit: Side, patch: PatchFrame) -> list[Any]:
+def context(frame: ObjectFrame, exit: Side, patch: PatchFrame) -> list[Lanes]:
     """The numbers of `N_CONTEXT`.
 
     x_o and y_o in the frame of the patch as v / (|v| + radius), the logarithms of both distances over the radius, n_o
     and w_o in that frame, and the radius, in mean free paths, and the way to y_o, as logarithms.
     """
 
-    def local(v: Any) -> list[Any]:
+    def local(v: Lanes) -> list[Lanes]:
         return [dr.dot(v, axis) for axis in patch.axes]
 
-    told: list[Any] = []
+    told: list[Lanes] = []
     for p in (exit.at.p, exit.event.y):
         d = p - patch.centre
         r = dr.norm(d)
@@ -210,7 +211,7 @@ def context(frame: ObjectFrame, exit: Side, patch: PatchFrame) -> list[Any]:
     return [*told, 1 / (1 + patch.radius * frame.sigma_t)]
 
 
-def _tangents(n: Any, towards: Any) -> tuple[Any, Any]:
+def _tangents(n: Lanes, towards: Lanes) -> tuple[Lanes, Lanes]:
     """Tangents of a normal, the first towards a point as seen from there; any where that is along the normal."""
     flat = towards - n * dr.dot(towards, n)
     length = dr.norm(flat)
@@ -218,7 +219,7 @@ def _tangents(n: Any, towards: Any) -> tuple[Any, Any]:
     return mi.Vector3f(s), mi.Vector3f(dr.cross(n, s))
 
 
-def direction_square(n: Any, towards: Any, w: Any) -> tuple[Any, Any]:
+def direction_square(n: Lanes, towards: Lanes, w: Lanes) -> tuple[Lanes, Lanes]:
     """Coordinates in [0, 1)² of a direction above a surface, uniform where it follows the cosine."""
     s, t = _tangents(n, towards)
     u = mi.warp.cosine_hemisphere_to_square(mi.Vector3f(dr.dot(w, s), dr.dot(w, t), dr.maximum(dr.dot(w, n), 0)))
@@ -240,12 +241,12 @@ PARAMETERS = 3 * BINS - 1
 class _Bin(NamedTuple):
     """Ends of a bin in x and y, and the slopes at both."""
 
-    x: Any
-    y: Any
-    dx: Any
-    dy: Any
-    d: Any
-    d_next: Any
+    x: Lanes
+    y: Lanes
+    dx: Lanes
+    dy: Lanes
+    d: Lanes
+    d_next: Lanes
 
 
 class Spline:
@@ -255,13 +256,13 @@ class Spline:
         raw: 3 K - 1 numbers of a network: widths, heights, slopes.
     """
 
-    def __init__(self, raw: Sequence[Any]) -> None:
+    def __init__(self, raw: Sequence[Lanes]) -> None:
         bound = -math.log(LEAST_SLOPE)
         slopes = [dr.exp(a / (1 + dr.abs(a) / bound)) for a in raw[2 * BINS :]]
         self.widths, self.heights = (_shares(part, bound) for part in (raw[:BINS], raw[BINS : 2 * BINS]))
         self.slopes = [1.0, *slopes, 1.0]
 
-    def _bin(self, at: Any, by_y: bool) -> _Bin:
+    def _bin(self, at: Lanes, by_y: bool) -> _Bin:
         """The bin in which x, or y, lies."""
         bin = _Bin(*map(mi.Float, (-1, -1, self.widths[0], self.heights[0], self.slopes[0], self.slopes[1])))
         x, y = mi.Float(-1), mi.Float(-1)
@@ -272,13 +273,13 @@ class Spline:
             bin = _Bin(*(dr.select(beyond, a, b) for a, b in zip(here, bin)))
         return bin
 
-    def forward(self, x: Any) -> tuple[Any, Any]:
+    def forward(self, x: Lanes) -> tuple[Lanes, Lanes]:
         """y and dy/dx."""
         b = self._bin(x, False)
         z = dr.clip((x - b.x) / b.dx, 0, 1)
         return b.y + b.dy * _rational(b, z), _slope(b, z)
 
-    def inverse(self, y: Any) -> tuple[Any, Any]:
+    def inverse(self, y: Lanes) -> tuple[Lanes, Lanes]:
         """x and dy/dx there."""
         b = self._bin(y, True)
         s, t = b.dy / b.dx, dr.clip((y - b.y) / b.dy, 0, 1)
@@ -288,19 +289,19 @@ class Spline:
         return b.x + z * b.dx, _slope(b, z)
 
 
-def _shares(raw: Sequence[Any], bound: float) -> list[Any]:
+def _shares(raw: Sequence[Lanes], bound: float) -> list[Lanes]:
     """2 softmax of bounded numbers."""
     logits = [dr.exp(a / (1 + 2 * dr.abs(a) / bound)) for a in raw]
     scale = 2 / sum(logits)
     return [v * scale for v in logits]
 
 
-def _rational(b: _Bin, z: Any) -> Any:
+def _rational(b: _Bin, z: Lanes) -> Lanes:
     s = b.dy / b.dx
     return (s * z * z + b.d * z * (1 - z)) / (s + (b.d + b.d_next - 2 * s) * z * (1 - z))
 
 
-def _slope(b: _Bin, z: Any) -> Any:
+def _slope(b: _Bin, z: Lanes) -> Lanes:
     s = b.dy / b.dx
     over = s + (b.d + b.d_next - 2 * s) * z * (1 - z)
     return s * s * (2 * s * z * (1 - z) + b.d * (1 - z) * (1 - z) + b.d_next * z * z) / (over * over)
@@ -329,13 +330,13 @@ class ConditionalFlow:
     def _network(self) -> Perceptron:
         return Perceptron.named(self.weights, "F", "h", activation=relu, looped=True)
 
-    def _splines(self, x: Sequence[Any], context: Sequence[Any]) -> list[Any]:
+    def _splines(self, x: Sequence[Lanes], context: Sequence[Lanes]) -> list[Lanes]:
         return self._network([*x, *context])
 
-    def _spline(self, raw: list[Any], j: int) -> Spline:
+    def _spline(self, raw: list[Lanes], j: int) -> Spline:
         return Spline(raw[j * PARAMETERS : (j + 1) * PARAMETERS])
 
-    def sample(self, context: Sequence[Any], u: Sequence[Any]) -> tuple[list[Any], Any]:
+    def sample(self, context: Sequence[Lanes], u: Sequence[Lanes]) -> tuple[list[Lanes], Lanes]:
         """x in [0, 1)^d for d uniform numbers, and its density."""
         x, density = [0.0] * self.n, 1.0
         for j in range(self.n):
@@ -344,7 +345,7 @@ class ConditionalFlow:
             density = density * slope
         return [0.5 * (v + 1) for v in x], density
 
-    def density(self, context: Sequence[Any], x: Sequence[Any]) -> Any:
+    def density(self, context: Sequence[Lanes], x: Sequence[Lanes]) -> Lanes:
         """Of x in [0, 1)^d."""
         inner, density = [2 * v - 1 for v in x], 1.0
         raw = self._splines(inner, context)
@@ -375,14 +376,14 @@ class FlowSampler:
         """Of the object."""
         return self.patches.frame
 
-    def sample(self, exit: Side, weights: PatchWeights, u_patch: Any, u: tuple[Any, Any]) -> tuple[Point, Any]:
+    def sample(self, exit: Side, weights: PatchWeights, u_patch: Lanes, u: tuple[Lanes, Lanes]) -> tuple[Point, Lanes]:
         """A point of entry and its density, 1/(scene unit)²."""
         patch, of_patch = self.patches.patch(weights, u_patch)
         told = context(self.frame, exit, self.chart.frame(patch))
         x, density = self.flow.sample(told, u)
         return self.chart.point(patch, tuple(x)), of_patch * density
 
-    def density(self, exit: Side, weights: PatchWeights, face: Any, p: Any) -> Any:
+    def density(self, exit: Side, weights: PatchWeights, face: Lanes, p: Lanes) -> Lanes:
         """Density of `sample` at a point of a face, 1/(scene unit)²."""
         patch = self.patches.patches.row("patch", face)
         told = context(self.frame, exit, self.chart.frame(patch))
@@ -408,12 +409,12 @@ class FlowProposals(CosineProposals):
     sign: float
     table: PatchTable | None = None
 
-    def prepare(self, out: SurfacePoint, prepared: PreparedExit, active: Any) -> _FlowOfExit:
+    def prepare(self, out: SurfacePoint, prepared: PreparedExit, active: Lanes) -> _FlowOfExit:
         weights = self.sampler.patches.prepare(prepared.side) if self.table is None else None
         return _FlowOfExit(prepared.side, weights)
 
     def sample(
-        self, out: SurfacePoint, prim_index: Any, prepared: _FlowOfExit, sampler: Any, active: Any
+        self, out: SurfacePoint, prim_index: Lanes, prepared: _FlowOfExit, sampler: mi.Sampler, active: Lanes
     ) -> EntrySample:
         u = sampler.next_1d(), tuple(sampler.next_2d())
         weights = prepared.weights if self.table is None else self.table.weights(prim_index)

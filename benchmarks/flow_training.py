@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from itertools import count
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -32,6 +32,7 @@ from full_geometry.transport.exit_pairs import trace_exits
 from full_geometry.transport.features import ObjectFrame, Side, first_event, side_features
 from full_geometry.transport.patches import Patches
 from full_geometry.transport.storing import Learnt
+from halfspace_sss.arrays import Lanes
 from halfspace_sss.checks import check_count
 from halfspace_sss.neural.training.fit import CpuSchedule, Objective, Source, fit
 from halfspace_sss.tracing.walk import generator, pass_seed
@@ -92,9 +93,9 @@ class Lighting:
     """
 
     object: TranslucentObject
-    sample_emitter: Callable[[Any, Any], tuple[Any, Any, Any]]
+    sample_emitter: Callable[[Lanes, Lanes], tuple[Lanes, Lanes, Lanes]]
 
-    def sample(self, entry: Any, u: Any, active: Any) -> tuple[Any, Any]:
+    def sample(self, entry: EntrySample, u: Lanes, active: Lanes) -> tuple[Lanes, Lanes]:
         """w_i at an entry, and the light from there over its density: 0 in the shadow."""
         w, value, distance = self.sample_emitter(entry, u)
         ray = ray_from(place(entry.p, entry.n), w, self.object.geometry.clearance)
@@ -179,7 +180,7 @@ def flow_walks(
     )
 
 
-def _rows(columns: list[Any], n: int) -> np.ndarray:
+def _rows(columns: list[Lanes], n: int) -> np.ndarray:
     """(n, columns) float32."""
     dr.eval(columns)
     return np.ascontiguousarray(np.stack([np.broadcast_to(c.numpy(), n) for c in columns], axis=1))

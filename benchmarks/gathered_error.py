@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pandas
@@ -15,8 +15,12 @@ from figures.computing.contenders import WALK
 from figures.computing.images import cover
 from figures.computing.scenes import prepare
 from figures.computing.timed import rendered
+from figures.parts.records import Row
 from full_geometry.integrators.gathering import Gathering
 from halfspace_sss.neural.store import weights_in
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 PASS = 64  # samples of a pixel at a time
 SAMPLED, ADDED, GATHERED = KINDS = "sampled over walks", "gathered over sampled", "gathered over walks"
@@ -85,7 +89,7 @@ def gathered_errors(
     return pandas.DataFrame(rows)
 
 
-def _of_model(gathers: Any, samples: Any, how: Comparing, inside: np.ndarray, walked: np.ndarray) -> dict[str, Any]:
+def _of_model(gathers: mi.Scene, samples: mi.Scene, how: Comparing, inside: np.ndarray, walked: np.ndarray) -> Row:
     """Errors by the scenes of a model."""
     found = []
     for k in range(how.gatherings):
@@ -110,7 +114,7 @@ def shown(table: pandas.DataFrame) -> pandas.DataFrame:
     return found
 
 
-def _halves(scene: Any, spp: int, inside: np.ndarray, *seed: int) -> np.ndarray:
+def _halves(scene: mi.Scene, spp: int, inside: np.ndarray, *seed: int) -> np.ndarray:
     """Two independent images of half the samples, (2, pixels, channels)."""
     each = min(PASS, spp // 2)
     passes = spp // (2 * each)

@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from benchmarks.inversion_textures import rms
+from figures.parts.records import Row, SceneDict
 from full_geometry import inverse
 from full_geometry.inverse.views import GivenView
 from full_geometry.scenes.mitsuba_scene import with_media
@@ -48,7 +48,7 @@ def target(number: int) -> dict[str, np.ndarray]:
 def medium_rows(
     case: str, number: int, size: int, spp: int, target_spp: int, steps: int, prb_steps: int, seed: int,
     progress: NamedProgress | None = None,
-) -> list[dict[str, Any]]:  # fmt: skip
+) -> list[Row]:  # fmt: skip
     """Of each way: errors of what was found, CPU seconds, and those after which errors of sigma_t stayed small.
 
     Args:
@@ -113,7 +113,7 @@ def _errors(found: Mapping[str, np.ndarray], true: Mapping[str, np.ndarray], g: 
     }
 
 
-def _cube(medium: Mapping[str, np.ndarray], kind: Mapping[str, float], size: int) -> dict[str, Any]:
+def _cube(medium: Mapping[str, np.ndarray], kind: Mapping[str, float], size: int) -> SceneDict:
     """A cube of 0.2 mm under a dim sky and a large lamp, seen from six sides."""
     at, film = mi.ScalarTransform4f(), _film(size)
     numbers = {key: ", ".join(map(repr, map(float, value))) for key, value in medium.items()}
@@ -137,13 +137,13 @@ def _cube(medium: Mapping[str, np.ndarray], kind: Mapping[str, float], size: int
     return scene
 
 
-def _film(size: int) -> dict[str, Any]:
+def _film(size: int) -> SceneDict:
     return {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}, "pixel_format": "rgb",
             "component_format": "float32"}  # fmt: skip
 
 
 def _prb(
-    start: dict[str, Any], images: list[np.ndarray], spp: int, steps: int, depth: int, seed: int, show: ProgressText
+    start: SceneDict, images: list[np.ndarray], spp: int, steps: int, depth: int, seed: int, show: ProgressText
 ) -> list[dict[str, np.ndarray]]:
     """The medium after each step of Adam on log sigma_t and logit albedo, by Mitsuba's gradients of volume paths."""
     scene = with_media(start, 1.0, {"type": "prbvolpath", "max_depth": depth})

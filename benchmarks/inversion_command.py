@@ -6,11 +6,12 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from benchmarks.tables import markdown
+from figures.parts.records import Row
 from full_geometry.cli.variants import use_mitsuba
 from halfspace_sss.checks import check_choice, check_count
 from halfspace_sss.cli.shared import Bar, OutFolder, console, whole
@@ -89,6 +90,6 @@ def inversion_command(
     write_together(files)
 
 
-def _painted(rows: Callable[..., list[dict[str, Any]]], *how: Any, progress: Callable) -> list[dict[str, Any]]:
+def _painted(rows: Callable[..., list[Row]], *how: object, progress: Callable) -> list[Row]:
     with TemporaryDirectory() as folder:
         return rows(*how, Path(folder), progress)

@@ -10,7 +10,8 @@ kernels (`DRJIT_CACHE_DIR` may name an empty folder).
 from __future__ import annotations
 
 import time
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -62,7 +63,7 @@ def gradient_rows(case: str, size: int, spp: int, seed: int, progress: NamedProg
     description["sky"] = {"type": "constant", "radiance": 0.15}
     unit = SCANS[scan].mm_per_unit
     description["integrator"] = {"type": "translucent_walk", "mm_per_unit": unit}
-    ways: dict[str, Any] = {"walk": lambda: load_scene(description, PATH_TRACED)}
+    ways: dict[str, Callable[[], mi.Scene]] = {"walk": lambda: load_scene(description, PATH_TRACED)}
     for depth in DEPTHS:
         prb = {"type": "prbvolpath", "max_depth": depth}
         ways[f"prbvolpath, depth {depth}"] = lambda prb=prb: with_media(description, unit, prb)

@@ -10,13 +10,13 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
 from figures.beyond.textures import bands, mosaic
 from figures.computing.scenes import BUNNY, MM_PER_UNIT
+from figures.parts.records import Row, SceneDict
 from figures.rivals import deng
 from full_geometry import inverse
 from full_geometry.geometry.mesh import vertex_positions
@@ -39,7 +39,7 @@ TEXELS = 128
 
 def texture_rows(
     thing: str, size: int, spp: int, steps: int, seed: int, folder: Path, progress: NamedProgress | None = None
-) -> list[dict[str, Any]]:
+) -> list[Row]:
     """Of each way, from the same images: errors of the albedo, and FLIP of images.
 
     Args:
@@ -104,7 +104,7 @@ def _albedo(thing: str) -> np.ndarray:
     return 1 - (1 - reflectance) ** 2
 
 
-def _object(thing: str, albedo: np.ndarray, path: Path) -> dict[str, Any]:
+def _object(thing: str, albedo: np.ndarray, path: Path) -> SceneDict:
     values = np.ascontiguousarray(albedo, dtype=np.float32)
     surface = {"type": "translucent", "sigma_t": SIGMA_T, "eta": 1.4}
     if thing == "ball":
@@ -118,7 +118,7 @@ def _object(thing: str, albedo: np.ndarray, path: Path) -> dict[str, Any]:
     return {"type": "ply", "filename": str(path), "bsdf": surface}
 
 
-def _scene(thing: dict[str, Any], size: int, model: str, lamp: list[float]) -> dict[str, Any]:
+def _scene(thing: SceneDict, size: int, model: str, lamp: list[float]) -> SceneDict:
     """An object with cameras around it and a lamp on one side; the dipole has no single scattering, as its authors."""
     at = mi.ScalarTransform4f()
     if model != PATH_TRACED:

@@ -10,7 +10,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -21,6 +20,7 @@ from full_geometry.trade.assessing import assess_stage
 from full_geometry.trade.job import Effort
 from full_geometry.trade.results import ObjectTrade
 from full_geometry.trade.techniques import Stage, Technique
+from halfspace_sss.arrays import Lanes
 from halfspace_sss.backend import clock
 from halfspace_sss.comparison.model_errors import model_error, references
 from halfspace_sss.neural.network import Network
@@ -112,7 +112,7 @@ def precision_settings(medium: Medium, events: float = 4e6, seed: int = 0) -> li
     return [Setting("precision", name, "neural", took / results[0][1], error) for name, took, error in results]
 
 
-def _rounded(network: Network, precision: str, features: Sequence[Any]) -> Any:
+def _rounded(network: Network, precision: str, features: Sequence[Lanes]) -> Lanes:
     """The network in a precision, for Dr.Jit arrays of single or double precision."""
     kind = type(sum(features[1:], features[0]))
     inner = _lanes(kind, precision)

@@ -5,8 +5,6 @@ Radiance is 1 from everywhere, irradiance 1 from a direction, or intensity 1. We
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -14,12 +12,13 @@ import torch
 
 from benchmarks.flow import Chart
 from benchmarks.flow_training import FlowBatch, FlowRecipe, Lighting, likelihood_weights, walks_of
-from full_geometry.geometry.points import cosine_above, opaque
+from full_geometry.geometry.points import EntrySample, cosine_above, opaque
 from full_geometry.learning.network_fitting import PatchLogits, patch_likelihood
 from full_geometry.objects.objects import TranslucentObject
 from full_geometry.transport.features import n_side
 from full_geometry.transport.patches import PatchSampler
 from full_geometry.transport.storing import Learnt
+from halfspace_sss.arrays import Lanes
 from halfspace_sss.neural.training.fit import Objective, fit
 from halfspace_sss.tracing.walk import generator, pass_seed
 
@@ -39,14 +38,14 @@ def lighting(name: str, obj: TranslucentObject) -> Lighting:
     towards = mi.Vector3f(*TOWARDS.tolist())
     place_of_light = mi.Point3f(*map(opaque, _above(obj)))
 
-    def sky(entry: Any, u: Any) -> tuple:
+    def sky(entry: EntrySample, u: Lanes) -> tuple:
         w, density = cosine_above(entry.n_out, entry.n, u)
         return w, 1 / dr.maximum(density, 1e-6), mi.Float(dr.inf)
 
-    def direction(entry: Any, u: Any) -> tuple:
+    def direction(entry: EntrySample, u: Lanes) -> tuple:
         return mi.Vector3f(towards), mi.Float(1), mi.Float(dr.inf)
 
-    def near(entry: Any, u: Any) -> tuple:
+    def near(entry: EntrySample, u: Lanes) -> tuple:
         d = place_of_light - entry.p
         r = dr.norm(d)
         return mi.Vector3f(d / r), 1 / (r * r), r

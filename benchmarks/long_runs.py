@@ -10,7 +10,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from full_geometry.trade.assessing import assess_stage
 from full_geometry.trade.job import Effort
@@ -32,7 +31,7 @@ def long_run(
 ) -> Assessment:
     """The mean of as many batches as it takes, at most `seconds`; those that the file holds are not run again."""
     how = {"format": FORMAT, "tolerance": tolerance, "seed": seed, "ways": [way.name for way in ways]}
-    batches: list[dict[str, Any]] = []
+    batches: list[dict[str, object]] = []
     if path.is_file():
         kept = json.loads(path.read_text(encoding="utf-8"))
         if how.items() <= kept.items():

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from figures.modelling.closed_shapes import SHAPES, SIZE, write_shape
 from halfspace_sss.checks import check_count
-from halfspace_sss.provenance import write_atomically
+from halfspace_sss.provenance import JsonDict, write_atomically
 
 LIGHTS = ("sky", "lamp", "lamp and sky", "windows")
 FILM = 512
@@ -43,7 +42,7 @@ class RandomScene:
     tolerance: float
     images: int
 
-    def record(self) -> dict[str, Any]:
+    def record(self) -> JsonDict:
         """Ready for JSON."""
         return asdict(self)
 

@@ -6,14 +6,14 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from benchmarks.alpha_p import fit_alpha_p
-from benchmarks.flow import FlowProposals
+from benchmarks.flow import FlowProposals, FlowSampler
 from benchmarks.flow_training import FlowRecipe, Lighting, fit_flow
 from benchmarks.lightings import LIGHTINGS, fit_patches, lighting
 from figures.rivals.paper_network import PaperNetwork, PaperRecipe, estimate, fit_paper
@@ -55,8 +55,8 @@ POINTS = ("walks", "uniform")  # of the paper's network
 
 
 def error_table(
-    scene: Any, name: str | None = None, *, seconds: float = 60.0, exits: int = 256, walks: int = 4096,
-    samples: int = 4096, n: int = 16, seed: int = 0, progress: Callable[[str, int, int], Any] | None = None,
+    scene: mi.Scene, name: str | None = None, *, seconds: float = 60.0, exits: int = 256, walks: int = 4096,
+    samples: int = 4096, n: int = 16, seed: int = 0, progress: Callable[[str, int, int], object] | None = None,
 ) -> pandas.DataFrame:  # fmt: skip
     """Rows of model, channel, light, error, standard error and ratio of the means.
 
@@ -132,8 +132,8 @@ TIMES = ((0.0, 1.0), (1 / 12, 1 / 4), (1 / 3, 1 / 2), (1.0, 1.0))  # shares of t
 
 
 def base_model_table(
-    scene: Any, name: str | None = None, *, seconds: float = 60.0, exits: int = 256, walks: int = 4096,
-    samples: int = 4096, seed: int = 0, progress: Callable[[str, int, int], Any] | None = None,
+    scene: mi.Scene, name: str | None = None, *, seconds: float = 60.0, exits: int = 256, walks: int = 4096,
+    samples: int = 4096, seed: int = 0, progress: Callable[[str, int, int], object] | None = None,
 ) -> pandas.DataFrame:  # fmt: skip
     """Rows of base model, planned and spent CPU seconds, steps, channel, light, error with its error, ratio of means.
 
@@ -165,7 +165,7 @@ def base_model_table(
 
 def _learnt(
     obj: TranslucentObject, base_model: str, seconds: float, part: float, seed: int
-) -> tuple[Learnt, dict[str, Any]]:
+) -> tuple[Learnt, dict[str, float]]:
     """A training with chunks of a part of those of the recipe; what it took."""
     recipe = replace(STANDARD.with_base_model(base_model), chunk=int(STANDARD.chunk * part))
     with TemporaryDirectory() as folder:
@@ -217,7 +217,7 @@ class _Exits:
     """Exits as a renderer has them, with their faces."""
 
     out: SurfacePoint
-    face: Any
+    face: mi.UInt32
 
 
 def _exits(obj: TranslucentObject, n: int, repeated: int, seed: int) -> _Exits:
@@ -236,7 +236,7 @@ def _exits(obj: TranslucentObject, n: int, repeated: int, seed: int) -> _Exits:
     return _Exits(SurfacePoint(p, n_face, n_out, w, mi.Float(sign)), face)
 
 
-def _estimates(model: ObjectModel, light: Lighting, exits: _Exits, rng: Any, n: int) -> Any:
+def _estimates(model: ObjectModel, light: Lighting, exits: _Exits, rng: Numbers, n: int) -> mi.Spectrum:
     """Sum of n samples of each exit, per channel."""
     on = mi.Bool(True)
     prepared = model.transport.prepare(exits.out, on)
@@ -310,7 +310,9 @@ SAMPLERS = (
 SAMPLES_OF_AN_EXIT = (1, 8)
 
 
-def samplers(learnt: Learnt, recipe: FlowRecipe, light: Lighting, flow: Any, seed: int = 0) -> dict[str, Proposals]:
+def samplers(
+    learnt: Learnt, recipe: FlowRecipe, light: Lighting, flow: FlowSampler, seed: int = 0
+) -> dict[str, Proposals]:
     """All ways of drawing entries of a trained object, by name.
 
     Args:
@@ -342,7 +344,7 @@ def samplers(learnt: Learnt, recipe: FlowRecipe, light: Lighting, flow: Any, see
 
 def sampler_table(
     learnt: Learnt, recipe: FlowRecipe, *, exits: int = 256, samples: int = 2048, seed: int = 0,
-    progress: Callable[[str, int, int], Any] | None = None,
+    progress: Callable[[str, int, int], object] | None = None,
 ) -> pandas.DataFrame:  # fmt: skip
     """Rows of light, sampler, V, seconds a million of an exit and of a sample, and V t for 1 and 8 samples an exit.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -14,6 +14,7 @@ from halfspace_sss.cli.shared import Bar, Define, ObjectId, OutFolder, console, 
 from halfspace_sss.provenance import check_folder, write_together
 
 if TYPE_CHECKING:
+    import mitsuba as mi
     import pandas
 
 
@@ -62,7 +63,7 @@ def rivals_command(
 
 
 def _made(
-    table: str, scene: Any, name: str | None, seconds: float, samples: int, seed: int, bar: Bar
+    table: str, scene: mi.Scene, name: str | None, seconds: float, samples: int, seed: int, bar: Bar
 ) -> pandas.DataFrame:
     from tempfile import TemporaryDirectory
 

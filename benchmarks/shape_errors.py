@@ -8,13 +8,13 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from figures.modelling.held_out import HELD_OUT
+from figures.parts.records import SceneDict
 from full_geometry.learning.model_errors import LIGHTS, RadianceError, errors_of, transport_of
 from full_geometry.learning.shape_data import draw_object
 from full_geometry.objects.objects import TranslucentObject, object_of
@@ -114,7 +114,7 @@ def evaluate(
         if progress:
             progress(case.name, k, n)
         obj = case.object
-        models: dict[str, Any] = {"neural_shape": transport(obj, path)}
+        models: dict[str, object] = {"neural_shape": transport(obj, path)}
         models |= {name: transport_of(obj, name) for name in HALF_SPACES if _takes(name, obj)}
         walks = WALKS * (MORE if float(obj.media[0].albedo_prime) < DARK else 1)
         errors = errors_of(obj, models, exits=EXITS, walks=walks, samples=SAMPLES, seed=seed)
@@ -144,7 +144,7 @@ def _row(case: Case, by_model: Mapping[str, list[RadianceError]]) -> Row:
 
 def seconds_per_million(obj: TranslucentObject, path: Path | None = None) -> dict[str, float]:
     """Seconds for a million evaluations, entry and exit prepared anew, of the network and of half-space models."""
-    models: dict[str, Any] = {"neural_shape": transport(obj, path)}
+    models: dict[str, object] = {"neural_shape": transport(obj, path)}
     models |= {name: transport_of(obj, name) for name in HALF_SPACES}
     rng = generator(mi, LANES, pass_seed(29))
     exits, entries = obj.random_points(rng), obj.random_points(rng)
@@ -276,7 +276,7 @@ def picture(case: Case, model: str, size: int = SIZE) -> np.ndarray:
     return np.maximum(np.array(image, dtype=float).reshape(size, size, -1).mean(axis=2), 0)
 
 
-def _scene(case: Case, path: Path, size: int) -> dict[str, Any]:
+def _scene(case: Case, path: Path, size: int) -> SceneDict:
     shape, m = case.object.geometry.shape, case.object.media[0]
     shape.write_ply(str(path))
     box = shape.bbox()

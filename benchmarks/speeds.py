@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -27,6 +26,7 @@ from figures.computing.modelled import VIEWS
 from figures.computing.scenes import SCANS, prepare, scan_scene, surroundings
 from figures.computing.timed import TimedRender, alternating, rendered
 from figures.modelling.objects import VARYING, tissue
+from figures.parts.records import Row, SceneDict
 from full_geometry.learning.meshes import surface
 from halfspace_sss import materials
 from halfspace_sss.neural.store import weights_in
@@ -88,7 +88,7 @@ class LitObject:
         _, of, material = self.name.partition(" of ")
         return materials.load(material).medium if of else tissue("candle wax").medium
 
-    def description(self, size: int, folder: Path) -> dict[str, Any]:
+    def description(self, size: int, folder: Path) -> SceneDict:
         """The scene as a dict, `size` pixels wide."""
         _, of, material = self.name.partition(" of ")
         if self.key in SCANS:
@@ -126,7 +126,7 @@ class LitObject:
         found["sky"] = {"type": "constant", "radiance": dim}
         return found
 
-    def _shape(self, size: int, folder: Path) -> dict[str, Any]:
+    def _shape(self, size: int, folder: Path) -> SceneDict:
         """A shape of `ACROSS` mean free paths."""
         path = folder / f"{self.key}.ply"
         if not path.is_file():
@@ -181,7 +181,7 @@ def ways_of(case: LitObject, how: Measuring) -> list[str]:
     return [*volumes, WALK, *(f"{model}, {kind}" for model in models for kind in kinds)]
 
 
-def scene_of(case: LitObject, way: str, size: int, folder: Path, **settings: Any) -> Any:
+def scene_of(case: LitObject, way: str, size: int, folder: Path, **settings: float | str) -> mi.Scene:
     """The Mitsuba scene of a way, or three, with further settings of the integrator."""
     model, _, kind = way.partition(", ")
     found = case.description(size, folder)
@@ -238,7 +238,7 @@ def speeds(
     return pandas.DataFrame(rows)
 
 
-def _measured(case: LitObject, how: Measuring, folder: Path, training: float) -> list[dict[str, Any]]:
+def _measured(case: LitObject, how: Measuring, folder: Path, training: float) -> list[Row]:
     scenes, ready_after, spp = {}, {}, {}
     for way in ways_of(case, how):
         spp[way] = SPP["volume" if way in VOLUMES else WALK if way == WALK else "model"]
@@ -289,7 +289,7 @@ def _noise(timed: TimedRender, covered: np.ndarray) -> tuple[float, float]:
     return max(value, 1e-30), float(np.std(without) * np.sqrt(n - 1) / max(value, 1e-30))
 
 
-def _next_frames(scene: Any, case: LitObject, folder: Path) -> tuple[float, float]:
+def _next_frames(scene: mi.Scene, case: LitObject, folder: Path) -> tuple[float, float]:
     """CPU seconds of the next frame of one sample a pixel, once the light or the camera has changed."""
     sensor = mi.load_dict(case.description(FRAME, folder)["sensor"])
     lights, views = mi.traverse(scene), mi.traverse(sensor)

@@ -17,7 +17,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -27,6 +26,7 @@ from benchmarks.speeds import VOLUMES, LitObject
 from figures.computing.contenders import ready
 from figures.computing.images import cover, denoised, guides
 from figures.computing.scenes import prepare
+from figures.parts.records import Row
 from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
 
 SAMPLED, PRECOMPUTED = "walk, light sampled", "walk, light precomputed"
@@ -60,14 +60,14 @@ def total_errors(
     """A row for each case, way, time, raw and denoised."""
     prepare()
     folder.mkdir(parents=True, exist_ok=True)
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
     for k, case in enumerate(cases):
         progress(f"{case.name}, {case.light}", k, len(cases))
         rows += _measured(case, how, folder)
     return pandas.DataFrame(rows)
 
 
-def _scene(case: LitObject, way: str, size: int, folder: Path) -> Any:
+def _scene(case: LitObject, way: str, size: int, folder: Path) -> mi.Scene:
     found = case.description(size, folder)
     if way in VOLUMES:
         return ready(way, found, case.key, case.medium)
@@ -75,7 +75,7 @@ def _scene(case: LitObject, way: str, size: int, folder: Path) -> Any:
     return load_scene(found, PATH_TRACED, settings={"light": kind, "layers": True})
 
 
-def _measured(case: LitObject, how: TotalErrors, folder: Path) -> list[dict[str, Any]]:
+def _measured(case: LitObject, how: TotalErrors, folder: Path) -> list[Row]:
     scenes = {way: _scene(case, way, how.size, folder) for way in WAYS}
     inside = cover(scenes[SAMPLED]) > 0
     about = guides(scenes[SAMPLED])
@@ -110,7 +110,7 @@ def _measured(case: LitObject, how: TotalErrors, folder: Path) -> list[dict[str,
     return rows
 
 
-def _samples(scene: Any, seconds: float, seed: int) -> int:
+def _samples(scene: mi.Scene, seconds: float, seed: int) -> int:
     """Samples of a pixel, a power of two, that take at most so many CPU seconds, but not half as many; at least one."""
     spp = 1
     _passes(scene, 0.0, spp, seed)  # compiles
@@ -119,7 +119,7 @@ def _samples(scene: Any, seconds: float, seed: int) -> int:
     return spp
 
 
-def _passes(scene: Any, seconds: float, spp: int, seed: int) -> tuple[np.ndarray, list[float]]:
+def _passes(scene: mi.Scene, seconds: float, spp: int, seed: int) -> tuple[np.ndarray, list[float]]:
     """Images of passes until these have taken so many CPU seconds, and what each took; at least one."""
     images: list[np.ndarray] = []
     took: list[float] = []

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any
 
 from benchmarks.long_runs import long_run
 from benchmarks.random_scenes import RandomScene, write_scene
@@ -29,7 +28,7 @@ TRAIN_SECONDS = 20.0
 FORMAT = "halfspace-sss trade check 7"
 
 
-def check_scene(scene: RandomScene, folder: Path, seconds: float, truth_seconds: float) -> dict[str, Any]:
+def check_scene(scene: RandomScene, folder: Path, seconds: float, truth_seconds: float) -> dict[str, object]:
     """The record of a scene: the assessment, and the mean of long runs; what the folder holds is not run again.
 
     Its object is learnt before, which is a cost of the model that needs it.
@@ -45,7 +44,7 @@ def check_scene(scene: RandomScene, folder: Path, seconds: float, truth_seconds:
     return {"scene": scene.record(), "quick": quick, "long": long.record()}
 
 
-def _quick(scene: RandomScene, on: Stage, ways: list[Technique], path: Path, seconds: float) -> dict[str, Any]:
+def _quick(scene: RandomScene, on: Stage, ways: list[Technique], path: Path, seconds: float) -> dict[str, object]:
     """The assessment as users make it, on which the recommendation rests."""
     how = {"format": FORMAT, "scene": scene.record(), "seconds": seconds, "ways": [way.name for way in ways]}
     if path.is_file():
@@ -59,11 +58,11 @@ def _quick(scene: RandomScene, on: Stage, ways: list[Technique], path: Path, sec
     return result
 
 
-def outcome(record: dict[str, Any]) -> dict[str, Any]:
+def outcome(record: dict[str, object]) -> dict[str, object]:
     """What came of a scene: error and cost of the recommendation by the long runs, and those of the cheapest way."""
     scene = RandomScene(**{k: tuple(v) if isinstance(v, list) else v for k, v in record["scene"].items()})
     quick, long = (Assessment.of(record[key]) for key in ("quick", "long"))
-    results: dict[str, Any] = {"number": scene.number, "shape": scene.shape, "light": scene.light, "mfp": scene.mfp}
+    results: dict[str, object] = {"number": scene.number, "shape": scene.shape, "light": scene.light, "mfp": scene.mfp}
     results |= {"tolerance": scene.tolerance, "images": scene.images, "seconds": quick.seconds}
     if not quick.objects[0].ways or quick.objects[0].is_dark:
         return {**results, "way": None}
@@ -100,7 +99,7 @@ def _least(row: TechniqueTrade, scene: RandomScene, pixels: float) -> float:
     return row.training + row.preparation + scene.images * pixels * max(math.ceil(row.variance / left), 1) * row.seconds
 
 
-def z_values(record: dict[str, Any]) -> list[tuple[str, float]]:
+def z_values(record: dict[str, object]) -> list[tuple[str, float]]:
     """(bias² of the assessment - that of the long run) over their standard errors together, for each way."""
     quick, long = (Assessment.of(record[key]) for key in ("quick", "long"))
     results = []

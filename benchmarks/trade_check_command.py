@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from full_geometry.cli.variants import Variant, use_mitsuba
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.cli.shared import Bar, Places, console, whole
-from halfspace_sss.provenance import check_folder
+from halfspace_sss.provenance import JsonDict, check_folder
 
 if TYPE_CHECKING:
     from benchmarks.random_scenes import RandomScene
@@ -53,7 +53,7 @@ def check_command(
     from halfspace_sss.provenance import provenance, write_together
 
     parts = {f"scene {k}": (random_scene(k, seed, tolerance), out.absolute(), assess, truth, variant) for k in numbers}
-    done: dict[str, dict[str, Any]] = {}
+    done: dict[str, JsonDict] = {}
     with places.executor() as executor, Bar("scenes") as bar:
         for name, record in completed(executor, _record, parts):
             done[name] = record
@@ -73,7 +73,7 @@ def check_command(
     console().print(text, highlight=False, markup=False, soft_wrap=True)
 
 
-def _record(scene: RandomScene, out: Path, assess: float, truth: float, variant: str) -> dict[str, Any]:
+def _record(scene: RandomScene, out: Path, assess: float, truth: float, variant: str) -> JsonDict:
     """The record of a scene; a worker takes the variant with its first one."""
     import mitsuba as mi
 

@@ -6,7 +6,6 @@ import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -19,6 +18,7 @@ from figures.drawing.page import page
 from figures.drawing.trade_plot import image_shots
 from figures.modelling.closed_shapes import write_shape
 from figures.parts.part import Part, Result, Task
+from figures.parts.records import Params, SceneDict
 from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.trade.results import Assessment
 from full_geometry.trade.techniques import GATHERED, LAMBERT, Technique
@@ -86,7 +86,7 @@ def _name(material: str, shape: str, light: str) -> str:
     return f"{material}, {shape}, {light}"
 
 
-def measured(task: Task) -> dict[str, Any]:
+def measured(task: Task) -> dict[str, object]:
     """The assessment of a scene, and an image by each way."""
     from full_geometry.trade.assessing import assess_stage
     from full_geometry.trade.images import small_images, with_flip
@@ -112,7 +112,7 @@ def measured(task: Task) -> dict[str, Any]:
     return {"assessment": result.record(), "seconds": p["seconds"], "shown": list(images), **numbered}
 
 
-def turned(task: Task) -> dict[str, Any]:
+def turned(task: Task) -> dict[str, object]:
     """What the knobs bring on a scene."""
     from benchmarks.knobs import channel_settings, entry_settings, node_settings, precision_settings
     from full_geometry.trade.techniques import stage
@@ -131,7 +131,7 @@ def turned(task: Task) -> dict[str, Any]:
     return {"settings": [{**vars(s), "material": p["material"]} for s in settings]}
 
 
-def _scene(p: Mapping[str, Any], folder: Path, medium: Medium | None = None) -> dict[str, Any]:
+def _scene(p: Params, folder: Path, medium: Medium | None = None) -> SceneDict:
     """The bunny, or what stands in its place at the same size; with a scalar medium instead of the material."""
     scene = bunny_scene(p["material"], 512, LIGHTS[p["light"]])
     if medium is not None:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from benchmarks.trade_check import TRAIN_SECONDS, WAYS, outcome, z_values
 from full_geometry.scenes.scene_files import PATH_TRACED
+from halfspace_sss.provenance import JsonDict
 
 if TYPE_CHECKING:
     import pandas
@@ -19,7 +20,7 @@ DEAR = 1.5  # times the cheapest way, up to which a recommendation is called che
 ALWAYS = ("neural", "better_dipole", PATH_TRACED, "auto")
 
 
-def outcomes(records: Sequence[dict[str, Any]]) -> pandas.DataFrame:
+def outcomes(records: Sequence[JsonDict]) -> pandas.DataFrame:
     """One row for each scene in which something is seen."""
     import pandas
 
@@ -27,7 +28,7 @@ def outcomes(records: Sequence[dict[str, Any]]) -> pandas.DataFrame:
     return pandas.DataFrame(rows)
 
 
-def summary(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def summary(records: Sequence[JsonDict]) -> JsonDict:
     """Counts of scenes: kept, cheap, misses by number; mean and spread of z; times of fixed choices.
 
     A fixed choice that never keeps the tolerance of a scene is counted as one that failed; times are sums over the
@@ -36,7 +37,7 @@ def summary(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
     table = outcomes(records)
     z = np.array([value for record in records for _, value in z_values(record)])
     cheap = table["ratio"] <= DEAR
-    results: dict[str, Any] = {"scenes": len(table), "kept": int(table["keeps"].sum()), "cheap": int(cheap.sum())}
+    results: JsonDict = {"scenes": len(table), "kept": int(table["keeps"].sum()), "cheap": int(cheap.sum())}
     results |= {"kept_and_cheap": int((table["keeps"] & cheap).sum())}
     results |= {"surely_cheap": int((table["sure_ratio"] <= DEAR).sum())}
     results["not_kept"] = [int(n) for n in table.loc[~table["keeps"], "number"]]
@@ -57,11 +58,11 @@ def summary(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return results
 
 
-def _always(table: pandas.DataFrame, name: str) -> dict[str, Any]:
+def _always(table: pandas.DataFrame, name: str) -> JsonDict:
     """A fixed choice: in how many scenes it can keep the tolerance, and its time there over the recommended one."""
     time = table[f"{name}_s"].astype(float)
     can = np.isfinite(time)
-    told: dict[str, Any] = {"keeps": int(can.sum())}
+    told: JsonDict = {"keeps": int(can.sum())}
     if can.any():
         ratio = time[can] / table.loc[can, "cost_s"]
         told |= {"seconds": float(time[can].sum()), "recommended_s": float(table.loc[can, "cost_s"].sum())}
@@ -81,7 +82,7 @@ the long runs say. `auto` is the choice of the model of that name for the tolera
 """
 
 
-def markdown(values: dict[str, Any], table: pandas.DataFrame, how: dict[str, Any]) -> str:
+def markdown(values: JsonDict, table: pandas.DataFrame, how: JsonDict) -> str:
     """The page: the summary and the misses.
 
     Args:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -94,12 +94,18 @@ def trade_table(scenes: Scenes) -> pandas.DataFrame:
     """A row for each scene and way that renders it."""
     import pandas
 
-    rows: list[dict[str, Any]] = []
+    rows: list[dict[str, object]] = []
     for (material, shape, light), o in scenes.items():
         for w in o.ways:
             if w.refusal:
                 continue
-            row: dict[str, Any] = {"material": material, "shape": shape, "light": light, "way": w.way, "bias": w.bias}
+            row: dict[str, object] = {
+                "material": material,
+                "shape": shape,
+                "light": light,
+                "way": w.way,
+                "bias": w.bias,
+            }
             row |= {"bias_standard_error": w.bias_error, "bias2": w.bias2, "bias2_standard_error": w.bias2_error}
             row["variance"] = w.variance
             row |= {"seconds_per_million": 1e6 * w.seconds, "cost": 1e6 * w.seconds * w.variance}
@@ -107,7 +113,7 @@ def trade_table(scenes: Scenes) -> pandas.DataFrame:
     return pandas.DataFrame(rows)
 
 
-def markdown(scenes: Scenes, seconds: float, settings: Sequence[Mapping[str, Any]] = ()) -> str:
+def markdown(scenes: Scenes, seconds: float, settings: Sequence[Mapping[str, object]] = ()) -> str:
     """What is recommended, the bias of every way, and its cost; `seconds` is what each scene had."""
     lines = [INTRODUCTION.format(seconds=seconds), "## The cheapest way that keeps a tolerance", ""]
     lines += ["For images of 512 x 512 pixels; in brackets seconds of all cores for all of them, training counted.", ""]

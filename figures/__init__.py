@@ -13,7 +13,7 @@ is drawn.
 
 A `Part` is a name, parameters ready for JSON, a function and its estimated work:
 
-    def render(task: Task) -> dict[str, Any]:
+    def render(task: Task) -> dict[str, object]:
         image = ...task.params["material"]...        # task.progress(done, total) moves the bar
         return {"image": image, "variance": variance, "mean": float(image.mean())}
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -63,7 +62,7 @@ def _view(name: str) -> View:
     return VIEWS[name]._replace(light=LIGHT)
 
 
-def shown(task: Task) -> dict[str, Any]:
+def shown(task: Task) -> dict[str, object]:
     """An object in its surroundings: the reference, or the image of a model by its gathered light."""
     import mitsuba as mi
 

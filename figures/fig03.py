@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from figures.computing.learnt import SHAPES, object_parts
 from figures.computing.scenes import BUNNY, bunny_scene, prepare
 from figures.parts.part import Part, Result, Task
+from figures.parts.records import Params
 from halfspace_sss.comparison.style import TEXT, paper, saved
 from halfspace_sss.provenance import check_folder
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+    from matplotlib.axes import Axes
+
+    from full_geometry.geometry.points import SurfacePoint
+    from full_geometry.objects.objects import TranslucentObject
+    from full_geometry.transport.features import ObjectFrame
+    from full_geometry.transport.storing import Learnt
 
 TITLE = "points of entry drawn by the paper's flow, without and with light, and by patches"
 SECONDS = {"draft": 6, "paper": 60}  # CPU time of the object, and of each flow
@@ -32,7 +42,7 @@ def parts(quality: str) -> list[Part]:
     ]
 
 
-def sampled(task: Task) -> dict[str, Any]:
+def sampled(task: Task) -> dict[str, object]:
     """Points in the object's frame over its radius, their RMSD to the nearest barycentre, and light where they are."""
     from figures.rivals.paper_flow import fit_space_flow, mesh_arrays, on_surface, rmsd
     from full_geometry.learning.training import train_by_cpu
@@ -67,7 +77,7 @@ def sampled(task: Task) -> dict[str, Any]:
     }
 
 
-def _lit(name: str, task: Task, resolution: int, seed: int) -> Any:
+def _lit(name: str, task: Task, resolution: int, seed: int) -> mi.Scene:
     """The candle with its flame, or the bunny with a small light behind."""
     from full_geometry.scenes.scene_files import open_scene
 
@@ -77,7 +87,7 @@ def _lit(name: str, task: Task, resolution: int, seed: int) -> Any:
     return open_scene(bunny_scene("potato", 16, "small light"), "neural")
 
 
-def _light(obj: Any, scene: Any, frame: Any) -> tuple[np.ndarray, np.ndarray]:
+def _light(obj: TranslucentObject, scene: mi.Scene, frame: ObjectFrame) -> tuple[np.ndarray, np.ndarray]:
     """Random places of the surface, and the light that arrives there."""
     from figures.rivals.paper_flow import irradiance
 
@@ -92,7 +102,7 @@ def _light_at(points: np.ndarray, places: np.ndarray, E: np.ndarray) -> float:
     return float(E[cKDTree(places).query(points)[1]].mean() / E.mean())
 
 
-def _lanes(n: int, seed: int) -> Any:
+def _lanes(n: int, seed: int) -> mi.PCG32:
     import mitsuba as mi
 
     from halfspace_sss.tracing.walk import generator, pass_seed
@@ -100,7 +110,7 @@ def _lanes(n: int, seed: int) -> Any:
     return generator(mi, n, pass_seed(seed))
 
 
-def _exit(obj: Any, towards: list[float]) -> Any:
+def _exit(obj: TranslucentObject, towards: list[float]) -> SurfacePoint:
     """The point of the surface that lies farthest towards the eye among those that face it, seen along its normal."""
     import drjit as dr
     import mitsuba as mi
@@ -113,7 +123,7 @@ def _exit(obj: Any, towards: list[float]) -> Any:
     return at._replace(w=mi.Vector3f(at.n_out))
 
 
-def _by_patches(learnt: Any, exit: Any, n: int) -> Any:
+def _by_patches(learnt: Learnt, exit: SurfacePoint, n: int) -> mi.Point3f:
     import drjit as dr
     import mitsuba as mi
 
@@ -126,7 +136,7 @@ def _by_patches(learnt: Any, exit: Any, n: int) -> Any:
     return learnt.sampler.sample(weights, *u)[0].p
 
 
-def _positions(frame: Any, p: Any) -> np.ndarray:
+def _positions(frame: ObjectFrame, p: mi.Point3f) -> np.ndarray:
     return np.array(frame.position(p), dtype=float).T
 
 
@@ -160,7 +170,7 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
     return files
 
 
-def _draw_points(ax: Any, numbers: Mapping[str, Any], kind: str, towards: tuple[float, float, float]) -> None:
+def _draw_points(ax: Axes, numbers: Params, kind: str, towards: tuple[float, float, float]) -> None:
     """The surface, brighter where light arrives, points as the eye sees them, those on the far side paler, the exit."""
     eye = np.array(towards) / np.linalg.norm(towards)
     right = np.cross([0, 1, 0], eye)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from figures.computing.contenders import long_walk
 from figures.computing.images import FLIP, RELATIVE_MSE, compared
 from figures.computing.scenes import BUNNY, bunny_scene, prepare
 from figures.parts.part import Part, Result, Task
+from figures.parts.records import Params, Row
 from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.learning import online
 from full_geometry.scenes import reference
@@ -23,6 +24,11 @@ from full_geometry.transport.storing import KIND
 from halfspace_sss.comparison.style import TEXT, Look, paper, saved
 from halfspace_sss.neural.store import weights_in
 from halfspace_sss.provenance import check_folder
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 TITLE = "error of the image over time: walks alone, walks that learn, the model trained before"
 SCENES = {  # material and lights
@@ -54,7 +60,7 @@ def parts(quality: str) -> list[Part]:
     return results
 
 
-def rivals(task: Task) -> dict[str, Any]:
+def rivals(task: Task) -> dict[str, object]:
     """Images at growing times of each way, and what was learnt."""
     prepare()
     p, seconds = task.params, task.params["seconds"]
@@ -101,7 +107,7 @@ def _gain(truth: Result) -> float:
     return 1 / float(np.percentile(image[image.max(axis=2) > 0], 97))
 
 
-def _errors(scene: str, truth: Result, ways: Result) -> list[dict[str, Any]]:
+def _errors(scene: str, truth: Result, ways: Result) -> list[Row]:
     """A row for each image: seconds, samples, relMSE and FLIP of the pixels of the object, and the phase."""
     reference, gain = truth.images["image"], np.float32(_gain(truth))
     mask, rows = reference.max(axis=2) > 0, []
@@ -114,7 +120,7 @@ def _errors(scene: str, truth: Result, ways: Result) -> list[dict[str, Any]]:
     return rows
 
 
-def _figure(results: Mapping[str, Result], tables: Mapping[str, list[dict[str, Any]]]) -> Any:
+def _figure(results: Mapping[str, Result], tables: Mapping[str, list[Row]]) -> Figure:
     """A row for each scene: relMSE and FLIP over seconds, and the last images."""
     from matplotlib.figure import Figure
 
@@ -138,7 +144,7 @@ def _figure(results: Mapping[str, Result], tables: Mapping[str, list[dict[str, A
     return figure
 
 
-def _curves(ax: Any, rows: list[dict[str, Any]], key: str, switch: float) -> None:
+def _curves(ax: Axes, rows: list[Row], key: str, switch: float) -> None:
     for way, look in LOOKS.items():
         points = [(row["seconds"], row[key]) for row in rows if row["way"] == way]
         ax.plot(*zip(*points), color=look.color, ls=look.dash, marker="o", ms=1.8, mew=0, label=look.label)
@@ -191,13 +197,13 @@ class Snapshots:
         self._started += self.seconds - now
 
 
-def _scene(p: dict[str, Any], model: str) -> Any:
+def _scene(p: Params, model: str) -> mi.Scene:
     from full_geometry.scenes.scene_files import open_scene
 
     return open_scene(bunny_scene(p["material"], p["size"], p["lights"]), model)
 
 
-def trained_online(p: dict[str, Any], folder: Path, seconds: float, train_seconds: float) -> dict[str, Any]:
+def trained_online(p: Params, folder: Path, seconds: float, train_seconds: float) -> dict[str, object]:
     """The object is learnt and rendered from nothing; weights must not be there.
 
     Args:
@@ -229,19 +235,19 @@ def trained_online(p: dict[str, Any], folder: Path, seconds: float, train_second
     return {"snapshots": result, "switch": switch[0], "training": image.about["training"]}
 
 
-def modelled(p: dict[str, Any], folder: Path, seconds: float) -> Snapshots:
+def modelled(p: Params, folder: Path, seconds: float) -> Snapshots:
     """The model renders with weights that are there."""
     return _rendered(_scene(p, p["model"]), folder / "model.exr", p["seed"] + 1, seconds)
 
 
-def walked(p: dict[str, Any], folder: Path, seconds: float) -> Snapshots:
+def walked(p: Params, folder: Path, seconds: float) -> Snapshots:
     """Walks alone."""
     from full_geometry.capabilities import PATH_TRACED
 
     return _rendered(_scene(p, PATH_TRACED), folder / "walked.exr", p["seed"] + 2, seconds)
 
 
-def _rendered(scene: Any, path: Path, seed: int, seconds: float) -> Snapshots:
+def _rendered(scene: mi.Scene, path: Path, seed: int, seconds: float) -> Snapshots:
     integrator = scene.integrator()
     if is_bssrdf(integrator):
         integrator.prepare(scene)

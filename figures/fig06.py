@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -63,7 +62,7 @@ def _name(light: str, view: int, model: str) -> str:
     return f"{light}, {view} degrees, {model}"
 
 
-def seen(task: Task) -> dict[str, Any]:
+def seen(task: Task) -> dict[str, object]:
     """The bunny under a light, from a view."""
     import mitsuba as mi
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -25,6 +24,7 @@ from figures.fig01 import LIGHT, RESOLUTION, SIZES, TRUTH, shown
 from figures.fig01 import SPP as OURS_SPP
 from figures.modelling.objects import TISSUES
 from figures.parts.part import Part, Result, Task
+from figures.parts.records import SceneDict
 from halfspace_sss.provenance import check_folder
 
 TITLE = "mandarin, meat, candle and croissant, path traced, by two rivals and ours, with FLIP"
@@ -72,14 +72,14 @@ def parts(quality: str) -> list[Part]:
     return results
 
 
-def _unlit(name: str, resolution: int, folder: Path, seed: int) -> dict[str, Any]:
+def _unlit(name: str, resolution: int, folder: Path, seed: int) -> SceneDict:
     """The shapes of an object that give no light themselves; its boundary mirrors nothing."""
     parts = {key: part for key, part in object_parts(name, resolution, folder, seed).items() if key not in LAMPS}
     parts[name]["bsdf"] = {**parts[name]["bsdf"], "reflection": False}
     return parts
 
 
-def deng(task: Task) -> dict[str, Any]:
+def deng(task: Task) -> dict[str, object]:
     """An object as the fit of Deng et al. has found it from photographs."""
     import mitsuba as mi
 
@@ -112,7 +112,7 @@ def deng(task: Task) -> dict[str, Any]:
     return {"image": image.astype(np.float32), "spp": p["spp"], **about}
 
 
-def distant(task: Task) -> dict[str, Any]:
+def distant(task: Task) -> dict[str, object]:
     """An object as the network of TG et al. shows it, before what it mirrors and the rest of the scene."""
     import mitsuba as mi
 

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from figures.computing.learnt import shape_of
 from figures.computing.scenes import BUNNY, prepare
 from figures.parts.part import Part, Result, Task
+from figures.parts.records import Params
 from halfspace_sss.comparison.style import COLUMN, paper, saved
+
+if TYPE_CHECKING:
+    from full_geometry.learning.model_errors import ExitRadiance, ExitTruth
+    from full_geometry.objects.objects import TranslucentObject
 
 TITLE = "error against the number of incident samples, the paper's network and ours"
 SECONDS = {"draft": 6, "paper": 600}  # CPU time of each training
@@ -35,14 +40,14 @@ def parts(quality: str) -> list[Part]:
     return results
 
 
-def truth_of(obj: Any, p: Mapping[str, Any]) -> Any:
+def truth_of(obj: TranslucentObject, p: Params) -> ExitTruth:
     """Exits and their radiance."""
     from full_geometry.learning.model_errors import reference
 
     return reference(obj, p["exits"], p["walks"], p["seed"])
 
 
-def _rmse(result: Any, truth: Any, per_estimate: float) -> dict[str, float]:
+def _rmse(result: ExitRadiance, truth: ExitTruth, per_estimate: float) -> dict[str, float]:
     """Relative RMSE of one estimate, its noise included and that of the truth taken out, mean over channels.
 
     Args:
@@ -60,7 +65,7 @@ def _rmse(result: Any, truth: Any, per_estimate: float) -> dict[str, float]:
     return values
 
 
-def ours(task: Task) -> dict[str, Any]:
+def ours(task: Task) -> dict[str, object]:
     """Errors of `full_geometry` with N entries by patches."""
     from full_geometry.learning.model_errors import modelled
     from full_geometry.learning.training import train_by_cpu
@@ -79,7 +84,7 @@ def ours(task: Task) -> dict[str, Any]:
     return {"rows": rows}
 
 
-def papers(task: Task) -> dict[str, Any]:
+def papers(task: Task) -> dict[str, object]:
     """Errors of the paper's network for one N, its points from walks and uniform."""
     from figures.rivals.paper_network import PaperRecipe, estimate, fit_paper
     from full_geometry.objects.objects import object_of

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -55,7 +54,7 @@ def parts(quality: str) -> list[Part]:
     return results
 
 
-def rendered(task: Task) -> dict[str, Any]:
+def rendered(task: Task) -> dict[str, object]:
     """The image of a model, and the CPU seconds it takes with gathering once it is compiled."""
     import mitsuba as mi
 

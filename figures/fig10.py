@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
 from figures.computing.learnt import accepting, weight_files
 from figures.parts.part import Part, Result, Task, unmodelled
+from figures.parts.records import Params
 from halfspace_sss.comparison.curve_set import Curve, CurveSet
 from halfspace_sss.comparison.reflectance_curves import FIG10_THETA_I, curves
 from halfspace_sss.materials import load
@@ -35,7 +35,7 @@ def parts(quality: str) -> list[Part]:
 
 
 @unmodelled
-def traced_curves(task: Task) -> dict[str, Any]:
+def traced_curves(task: Task) -> dict[str, object]:
     """The path-traced curve of one angle."""
     p = task.params
     result = curves(
@@ -45,7 +45,7 @@ def traced_curves(task: Task) -> dict[str, Any]:
     return _as_numbers(result)
 
 
-def model_curves(task: Task) -> dict[str, Any]:
+def model_curves(task: Task) -> dict[str, object]:
     """The curves of one model for all angles."""
     name, angles = task.params["model"], task.params["theta_i_deg"]
     return _as_numbers(curves("fig10", theta_i_deg=angles, models=[name], n_paths=0, progress=task.progress))
@@ -77,7 +77,7 @@ def _traced_name(theta_i_deg: float) -> str:
     return f"path traced, {theta_i_deg:g} degrees"
 
 
-def _as_numbers(result: CurveSet) -> dict[str, Any]:
+def _as_numbers(result: CurveSet) -> dict[str, object]:
     """What `curve_set` needs, ready for JSON."""
     plain = ("title", "theta_o_deg", "delta_phi_deg", "line_deg", "half_width", "orders", "n_paths", "seed", "backend")
     common = {name: getattr(result, name) for name in plain}
@@ -94,7 +94,7 @@ def _as_numbers(result: CurveSet) -> dict[str, Any]:
     }
 
 
-def _as_curve(values: Mapping[str, Any]) -> Curve:
+def _as_curve(values: Params) -> Curve:
     arrays = {name: np.array(values[name]) for name in ("S", "S_at_r", "standard_error")}
     reflectance = {order: tuple(each) for order, each in values["reflectance"].items()}
     return Curve(**{**values, **arrays, "reflectance": reflectance})

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from figures.computing.timed import TimedRender, alternating, pass_size
 from figures.drawing.image_files import image_files
 from figures.drawing.labels import label
 from figures.parts.part import Part, Result, Task
+from figures.parts.records import Row
 from halfspace_sss import materials
 
 TITLE = "path tracing and ours in equal time, raw and denoised, with FLIP"
@@ -55,7 +55,7 @@ def parts(quality: str) -> list[Part]:
     return results
 
 
-def rivals(task: Task) -> dict[str, Any]:
+def rivals(task: Task) -> dict[str, object]:
     """What each method makes of the same time, raw and denoised."""
     check_denoiser()
     prepare()
@@ -80,7 +80,7 @@ def _key(name: str, state: str) -> str:
     return f"{name.replace(' ', '_')}-{state}"
 
 
-def _numbers(timed: TimedRender, seconds: float) -> dict[str, Any]:
+def _numbers(timed: TimedRender, seconds: float) -> Row:
     return {
         "spp": timed.spp,
         "seconds": timed.seconds,
@@ -101,7 +101,7 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
     )
 
 
-def _shots(truth: Result, rivals: Result, material: str) -> tuple[str, list[Shot], list[dict[str, Any]]]:
+def _shots(truth: Result, rivals: Result, material: str) -> tuple[str, list[Shot], list[Row]]:
     """The material with its exposure, the images that are shown, multiplied by it, and the rows of all methods."""
     reference = reference_shot(truth, "Path traced, long")
     shots, rows = {}, [{"material": material, "method": WALK, "state": "truth", **reference[0].numbers}]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,7 +15,11 @@ from figures.computing.references import reference_image
 from figures.computing.scenes import BUNNY, bunny_scene, prepare
 from figures.drawing.image_files import image_files
 from figures.parts.part import Part, Result, Task
+from figures.parts.records import Params
 from halfspace_sss.neural.store import weights_in
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 TITLE = "one sample a pixel, with and without sampling that has learnt"
 SIZES = {"draft": 128, "paper": 384}
@@ -41,7 +45,7 @@ def parts(quality: str) -> list[Part]:
     return [Part("bunny", rendered, params, seconds + REFERENCE_SPP[quality] * size**2 * 1e-6, inputs=(BUNNY,))]
 
 
-def rendered(task: Task) -> dict[str, Any]:
+def rendered(task: Task) -> dict[str, object]:
     """The images of all samplers and numbers of entries under all lights, by gathered light, and the converged ones."""
     prepare()
     p, results, done = task.params, {}, 0
@@ -83,7 +87,7 @@ def _weights(task: Task) -> dict[str, Path]:
     return folders
 
 
-def _image(folder: Path, p: Mapping[str, Any], light: str, entries: int, gathered: bool = False) -> np.ndarray:
+def _image(folder: Path, p: Params, light: str, entries: int, gathered: bool = False) -> np.ndarray:
     """The image of one path a pixel with the weights of a folder, light sampled or gathered."""
     import mitsuba as mi
 
@@ -92,7 +96,7 @@ def _image(folder: Path, p: Mapping[str, Any], light: str, entries: int, gathere
         return np.array(mi.render(scene, spp=1, seed=7), dtype=np.float32)
 
 
-def _scene(p: Mapping[str, Any], light: str, entries: int = 1, gathering: str = "sampled") -> Any:
+def _scene(p: Params, light: str, entries: int = 1, gathering: str = "sampled") -> mi.Scene:
     """The bunny, orders from two on."""
     from full_geometry.scenes.scene_files import load_scene
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from figures import fig07
 from figures.computing.contenders import OF_OBJECTS
@@ -16,6 +16,7 @@ from figures.computing.scenes import BUNNY, MATERIALS
 from figures.drawing.labels import in_markdown, label
 from figures.fig09 import LIGHTS, rendered
 from figures.parts.part import Part, Result
+from figures.parts.records import Row
 from halfspace_sss import materials
 
 TITLE = "time of training and rendering, samples and size of weights, the paper's beside"
@@ -118,7 +119,7 @@ def _per_million(result: Result) -> float:
     return 1e6 * result.numbers["cpu seconds of a sample"] / (rows * columns)
 
 
-def _row(results: Mapping[str, Result], material: str, model: str, entries: int) -> dict[str, Any]:
+def _row(results: Mapping[str, Result], material: str, model: str, entries: int) -> Row:
     result = results[_name(material, model, entries)]
     pixels = result.images["image"].shape[0] * result.images["image"].shape[1]
     row = {"material": material, "model": label(model), "N": entries, "training, CPU s": 0.0, "steps": 0, "walks": 0}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,8 +14,12 @@ from figures.computing.scenes import BUNNY, prepare, scan_scene
 from figures.computing.timed import gathered_anew, power_of_two, rendered
 from figures.drawing.image_files import image_files
 from figures.parts.part import Part, Result, Task
+from figures.parts.records import Row
 from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
 from halfspace_sss.backend import clock
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 TITLE = "walked, sampled, gathered, and walked with light precomputed, in equal time"
 MATERIALS = ("marble",)
@@ -51,14 +55,14 @@ def parts(quality: str) -> list[Part]:
     return results
 
 
-def in_time(task: Task) -> dict[str, Any]:
+def in_time(task: Task) -> dict[str, object]:
     """What each way makes of the same time."""
     prepare()
     p, found, numbers = task.params, {}, {}
     with with_weights(task.folder, task.needed):
         for way, (model, light) in WAYS.items():
 
-            def load(model: str = model, light: str = light) -> Any:
+            def load(model: str = model, light: str = light) -> mi.Scene:
                 description = scan_scene("bunny", p["material"], p["size"], p["lights"])
                 return load_scene(description, model, settings={"light": light})
 
@@ -66,7 +70,7 @@ def in_time(task: Task) -> dict[str, Any]:
     return {**found, "ways": numbers}
 
 
-def _passes(load: Callable[[], Any], seconds: float, seed: int, light: str) -> tuple[np.ndarray, dict[str, Any]]:
+def _passes(load: Callable[[], mi.Scene], seconds: float, seed: int, light: str) -> tuple[np.ndarray, Row]:
     """The mean of passes that take so long, light gathered or precomputed anew among it, and their numbers."""
     scene = load()
     rendered(scene, PILOT, seed, 0)  # compiles

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from figures.drawing.image_files import against_walks, image_files, rows_of
 from figures.modelling.head import make_head, write_painted
 from figures.modelling.held_out import HELD_OUT
 from figures.parts.part import Part, Result, Task, unmodelled
+from figures.parts.records import SceneDict
 from full_geometry.learning.meshes import Box, surface
 from full_geometry.learning.shapes import box, make_shape
 from halfspace_sss.physics.medium import Medium
@@ -61,41 +61,41 @@ def parts(quality: str) -> list[Part]:
     return results
 
 
-def learnt(task: Task) -> dict[str, Any]:
+def learnt(task: Task) -> dict[str, object]:
     """Weights of a thing, of the jelly with its stone."""
     prepare()
     return trained(task, _scene(task), "thing")
 
 
 @unmodelled
-def path_traced(task: Task) -> dict[str, Any]:
+def path_traced(task: Task) -> dict[str, object]:
     """The image by random walks."""
     return walked(task, _scene)
 
 
-def rendered(task: Task) -> dict[str, Any]:
+def rendered(task: Task) -> dict[str, object]:
     """The image of a model."""
     with with_weights(task.folder, task.needed):
         return shown(task, _scene)
 
 
-def _scene(task: Task) -> dict[str, Any]:
+def _scene(task: Task) -> SceneDict:
     p, folder = task.params, check_folder(task.folder)
     name = p["thing"]
     things = {"head": _head, "leaf": _leaf, "jelly": _jelly}[name](folder, p["resolution"])
     return lit_scene(things, STAGES[name], p["size"], MM_PER_UNIT[name])
 
 
-def _head(folder: Path, resolution: int) -> dict[str, Any]:
+def _head(folder: Path, resolution: int) -> SceneDict:
     result = write_painted(make_head(resolution), folder / "head.ply")
     return {"thing": {**result["shape"], "bsdf": _painted(result["paint"], WAX_MFP)}}
 
 
-def _painted(reflectance: dict[str, Any], mfp: str) -> dict[str, Any]:
+def _painted(reflectance: SceneDict, mfp: str) -> SceneDict:
     return {"type": "translucent", "reflectance": reflectance, "mfp": mfp, "eta": 1.4, "model": "better_dipole"}
 
 
-def _leaf(folder: Path, resolution: int) -> dict[str, Any]:
+def _leaf(folder: Path, resolution: int) -> SceneDict:
     """A leaf whose colour is an attribute of its vertices."""
     mesh = make_shape("leaves", LEAF_SEED, resolution, HELD_OUT)
     shape = mesh.mitsuba("leaf")
@@ -117,7 +117,7 @@ def leaf_colours(p: np.ndarray) -> np.ndarray:
     return (1 - vein) * blade + vein * np.array([0.55, 0.58, 0.25])
 
 
-def _jelly(folder: Path, resolution: int) -> dict[str, Any]:
+def _jelly(folder: Path, resolution: int) -> SceneDict:
     """A cube of jelly with an opaque stone in it."""
     import mitsuba as mi
 

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from figures.computing import contenders
 from figures.computing.learnt import weight_files
 from figures.computing.scenes import prepare
 from figures.parts.part import Part, Result, Task
+from figures.parts.records import Params, SceneDict
 from halfspace_sss.comparison.style import COLUMN, look, paper, saved
 from halfspace_sss.physics.medium import Medium
 
@@ -42,7 +42,7 @@ def parts(quality: str) -> list[Part]:
     return results
 
 
-def measured(task: Task) -> dict[str, Any]:
+def measured(task: Task) -> dict[str, object]:
     """Mean radiance of the spheres, and its standard error."""
     import warnings
 
@@ -63,7 +63,7 @@ def measured(task: Task) -> dict[str, Any]:
     return {"mean": means, "standard_error": errors}
 
 
-def _scene(radius: float, p: Mapping[str, Any]) -> dict[str, Any]:
+def _scene(radius: float, p: Params) -> SceneDict:
     """A sphere of sigma_t 1 that fills an orthographic image; its boundary reflects, all orders."""
     import mitsuba as mi
 
@@ -80,7 +80,7 @@ def _scene(radius: float, p: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _sky(light: str) -> dict[str, Any]:
+def _sky(light: str) -> SceneDict:
     """Radiance 1 from everywhere, or from one half of all directions."""
     import mitsuba as mi
 
@@ -120,7 +120,7 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
     return files
 
 
-def _ratio(values: Mapping[str, Any], truth: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+def _ratio(values: Params, truth: Params) -> tuple[np.ndarray, np.ndarray]:
     a, b = np.array(values["mean"]), np.array(truth["mean"])
     relative = np.hypot(np.array(values["standard_error"]) / a, np.array(truth["standard_error"]) / b)
     return a / b, a / b * relative

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -13,6 +12,7 @@ from figures.computing.scenes import BUNNY, MM_PER_UNIT
 from figures.computing.things import Staging, lit_scene, shown, thing_parts, walked
 from figures.drawing.image_files import against_walks, image_files, rows_of
 from figures.parts.part import Part, Result, Task, unmodelled
+from figures.parts.records import SceneDict
 from halfspace_sss.neural.universal import shipped_weights
 from halfspace_sss.provenance import check_folder
 
@@ -52,22 +52,22 @@ def parts(quality: str) -> list[Part]:
 
 
 @unmodelled
-def path_traced(task: Task) -> dict[str, Any]:
+def path_traced(task: Task) -> dict[str, object]:
     """The image by random walks."""
     return walked(task, _scene)
 
 
-def rendered(task: Task) -> dict[str, Any]:
+def rendered(task: Task) -> dict[str, object]:
     """The image of a model."""
     return shown(task, _scene)
 
 
-def _scene(task: Task) -> dict[str, Any]:
+def _scene(task: Task) -> SceneDict:
     thing = _bunny(check_folder(task.folder)) if task.params["thing"] == "bunny" else _ball()
     return lit_scene({"thing": thing}, STAGE, task.params["size"], MM_PER_UNIT)
 
 
-def _bunny(folder: Path) -> dict[str, Any]:
+def _bunny(folder: Path) -> SceneDict:
     """The bunny with a mosaic as an attribute of its vertices."""
     import mitsuba as mi
 
@@ -94,7 +94,7 @@ def mosaic(p: np.ndarray) -> np.ndarray:
     return edge * paint + (1 - edge) * np.array(GROUT)
 
 
-def _ball() -> dict[str, Any]:
+def _ball() -> SceneDict:
     """A banded ball, whose bands differ in reflectance and mean free path."""
     import mitsuba as mi
 

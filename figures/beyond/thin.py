@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from figures.computing.learnt import weight_files
 from figures.computing.references import NOTE
@@ -13,6 +13,7 @@ from figures.computing.things import Staging, lit_scene, shown, thing_parts, wal
 from figures.drawing.image_files import against_walks, image_files, rows_of
 from figures.modelling.held_out import HELD_OUT
 from figures.parts.part import Part, Result, Task, unmodelled
+from figures.parts.records import SceneDict
 from full_geometry.learning.shapes import TRAINING, make_shape
 from halfspace_sss import materials
 from halfspace_sss.provenance import check_folder
@@ -62,17 +63,17 @@ def parts(quality: str) -> list[Part]:
 
 
 @unmodelled
-def path_traced(task: Task) -> dict[str, Any]:
+def path_traced(task: Task) -> dict[str, object]:
     """The image by random walks."""
     return walked(task, _scene)
 
 
-def rendered(task: Task) -> dict[str, Any]:
+def rendered(task: Task) -> dict[str, object]:
     """The image of a model."""
     return shown(task, _scene)
 
 
-def _scene(task: Task) -> dict[str, Any]:
+def _scene(task: Task) -> SceneDict:
     p, thing = task.params, THINGS[task.params["thing"]]
     path = _mesh(thing, p["resolution"], check_folder(task.folder))
     surface = {"type": "translucent", "material": thing.material, "model": "neural"}

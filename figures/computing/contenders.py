@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from figures.computing.scenes import long_render, prepare, scan_scene
 from figures.parts.part import Task, unmodelled
+from figures.parts.records import SceneDict
 from full_geometry.transport.models import model_names
 from halfspace_sss import bssrdf
 from halfspace_sss.neural.symmetric import channels
 from halfspace_sss.physics.medium import Medium
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 MODELS = ("standard_dipole", "better_dipole", "directional_dipole", "photon_beam_diffusion", "neural")
 OF_OBJECTS = tuple(name for name in ("neural_shape", "full_geometry") if name in model_names())
@@ -32,7 +36,7 @@ VOLUMES = tuple(volume(rr_depth) for rr_depth in RR_DEPTHS)
 def contender(
     method: str, material: str, size: int, lights: str, bare: bool = False, sampler: str = "independent",
     scan: str = "bunny",
-) -> Any:  # fmt: skip
+) -> mi.Scene | tuple[mi.Scene, ...]:  # fmt: skip
     """The scene of a scanned object for a method, see `ready`.
 
     Args:
@@ -48,7 +52,9 @@ def contender(
     return ready(method, description, scan, materials.load(material).medium, bare)
 
 
-def ready(method: str, description: dict[str, Any], name: str, medium: Medium, bare: bool = False) -> Any:
+def ready(
+    method: str, description: SceneDict, name: str, medium: Medium, bare: bool = False
+) -> mi.Scene | tuple[mi.Scene, ...]:
     """The Mitsuba scene for a method, or three, one for each channel; `timed.rendered` takes both.
 
     Mitsuba's media have one phase function for all channels: it is given the channels of others one by one.
@@ -75,7 +81,7 @@ def ready(method: str, description: dict[str, Any], name: str, medium: Medium, b
     return load_scene(description, method, bssrdf(method, medium).orders)
 
 
-def _volume_scene(description: dict[str, Any], name: str, medium: Medium, rr_depth: int) -> Any:
+def _volume_scene(description: SceneDict, name: str, medium: Medium, rr_depth: int) -> mi.Scene | tuple[mi.Scene, ...]:
     from full_geometry.scenes.mitsuba_scene import with_media
 
     integrator = {"type": _VOLUME, "max_depth": -1, "rr_depth": rr_depth, "hide_emitters": True}
@@ -91,7 +97,7 @@ def _volume_scene(description: dict[str, Any], name: str, medium: Medium, rr_dep
 
 
 @unmodelled
-def long_walk(task: Task) -> dict[str, Any]:
+def long_walk(task: Task) -> dict[str, object]:
     """A long image by our walk, in passes that survive an interruption: what the other images are compared with.
 
     The parameters of the task are material, size, lights, spp, seed and, unless it is the bunny, scan.
@@ -101,7 +107,7 @@ def long_walk(task: Task) -> dict[str, Any]:
     return long_passes(task, contender(WALK, p["material"], p["size"], p["lights"], scan=p.get("scan", "bunny")))
 
 
-def long_passes(task: Task, scene: Any) -> dict[str, Any]:
+def long_passes(task: Task, scene: mi.Scene) -> dict[str, object]:
     """`long_render` of the samples per pixel "spp" of a task, in passes that are its eighth at most."""
     each = min(max(task.params["spp"] // 8, 1), LONG_PASS)
     return long_render(task, scene, each, max(task.params["spp"] // each, 2))

@@ -5,12 +5,16 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from full_geometry.trade.image_differences import check_image, flip_ldr, luminance, relative_mse, srgb
 from halfspace_sss.backend import BackendError
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 
 def stops_of(reference: np.ndarray, mask: np.ndarray) -> float:
@@ -26,7 +30,7 @@ def noise_of(image: np.ndarray, variance: np.ndarray, mask: np.ndarray) -> float
 GUIDE_SPP = 64
 
 
-def check_denoiser() -> Any:
+def check_denoiser() -> ModuleType:
     """The package `mitsuba_oidn`; BackendError with what to install where there is none."""
     try:
         import mitsuba_oidn
@@ -35,12 +39,12 @@ def check_denoiser() -> Any:
     return mitsuba_oidn
 
 
-def cover(scene: Any, spp: int = GUIDE_SPP) -> np.ndarray:
+def cover(scene: mi.Scene, spp: int = GUIDE_SPP) -> np.ndarray:
     """Share of each pixel that objects cover, (H, W), float32."""
     return _cover(_aovs(scene, "n:sh_normal", spp, 0))
 
 
-def guides(scene: Any, spp: int = GUIDE_SPP, sensor: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def guides(scene: mi.Scene, spp: int = GUIDE_SPP, sensor: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Mean albedo of each pixel (H, W, 3) and mean shading normal (H, W, 3), both float32.
 
     The albedo of translucent objects is their directional albedo. Where there is none at all, as of mirrors and glass,
@@ -51,7 +55,7 @@ def guides(scene: Any, spp: int = GUIDE_SPP, sensor: int = 0) -> tuple[np.ndarra
     return np.where(albedo.any(axis=2, keepdims=True), albedo, _cover(normal)[..., None]), np.clip(normal, -1, 1)
 
 
-def _aovs(scene: Any, aovs: str, spp: int, sensor: int) -> np.ndarray:
+def _aovs(scene: mi.Scene, aovs: str, spp: int, sensor: int) -> np.ndarray:
     import mitsuba as mi
 
     integrator = mi.load_dict({"type": "aov", "aovs": aovs})

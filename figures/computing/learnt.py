@@ -7,22 +7,26 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from figures.computing.scenes import BUNNY, MM_PER_UNIT, SCANS, prepare, scan_scene
 from figures.modelling.candle import make_candle
 from figures.modelling.objects import candle_parts, learnable_parts, make_varying, tissue
 from figures.parts.part import Part, Result, Task
+from figures.parts.records import SceneDict
 from halfspace_sss import bssrdf, materials, models
 from halfspace_sss.neural.store import weights_in
 from halfspace_sss.neural.symmetric import channels
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder
 
+if TYPE_CHECKING:
+    import mitsuba as mi
+
 SHAPES = ("bunny", "candle")
 
 
-def shape_of(name: str, folder: Path, resolution: int = 96, seed: int = 0) -> tuple[Any, Medium, float]:
+def shape_of(name: str, folder: Path, resolution: int = 96, seed: int = 0) -> tuple[mi.Shape, Medium, float]:
     """A Mitsuba shape, its medium and millimetres of a unit: the bunny of potato, or the candle of wax.
 
     Args:
@@ -95,7 +99,7 @@ def train_modelled(name: str, resolution: int, chunks: int, seed: int = 0) -> Pa
     return Part(training_of(name), _modelled, params, chunks)
 
 
-def object_parts(name: str, resolution: int, folder: Path, seed: int = 0, model: str = "neural") -> dict[str, Any]:
+def object_parts(name: str, resolution: int, folder: Path, seed: int = 0, model: str = "neural") -> SceneDict:
     """A modelled object with a smooth boundary, and what belongs to it, for a scene in mm.
 
     Args:
@@ -109,13 +113,13 @@ def object_parts(name: str, resolution: int, folder: Path, seed: int = 0, model:
     return learnable_parts(result, folder, model)
 
 
-def _scanned(task: Task) -> dict[str, Any]:
+def _scanned(task: Task) -> dict[str, object]:
     prepare()
     p = task.params
     return trained(task, scan_scene(p["scan"], p["material"], 16, "even sky"), p["scan"])
 
 
-def _modelled(task: Task) -> dict[str, Any]:
+def _modelled(task: Task) -> dict[str, object]:
     prepare()
     p, name = task.params, task.params["object"]
     shown = object_parts(name, p["resolution"], check_folder(task.folder), p["seed"])
@@ -123,7 +127,7 @@ def _modelled(task: Task) -> dict[str, Any]:
     return trained(task, scene, name)
 
 
-def trained(task: Task, scene: dict[str, Any], name: str) -> dict[str, Any]:
+def trained(task: Task, scene: SceneDict, name: str) -> dict[str, object]:
     """Weights of the object called `name` in the description of a scene, with what they took.
 
     The parameters "chunks" and "seed" of the task are those of the training.

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from figures.computing.scenes import environment
+from figures.parts.records import SceneDict
 
 FLOOR, GAP = (0.33, 0.3, 0.27), 0.02  # reflectance of the floor, and how far it lies below the lowest point, mm
 
@@ -29,7 +29,7 @@ VIEWS = {
 }
 
 
-def scene(shown: Mapping[str, Any], view: View, size: int, low: float = 0.0) -> dict[str, Any]:
+def scene(shown: SceneDict, view: View, size: int, low: float = 0.0) -> SceneDict:
     """A scene of parts on a grey floor below the height `low`, mm, for `mitsuba.load_dict`; without an integrator."""
     import mitsuba as mi
 
@@ -50,7 +50,7 @@ def scene(shown: Mapping[str, Any], view: View, size: int, low: float = 0.0) -> 
     }
 
 
-def foot(part: Mapping[str, Any]) -> float:
+def foot(part: SceneDict) -> float:
     """Height of the lowest point of a mesh in a file, mm; 0 if it is above."""
     import mitsuba as mi
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,6 +21,9 @@ from figures.computing.images import (
 from figures.computing.scenes import long_render, prepare
 from figures.parts.part import Result, Task, unmodelled
 
+if TYPE_CHECKING:
+    import mitsuba as mi
+
 SPP_PER_PASS = 32
 NOTE = (
     "The reference is path traced and denoised by Open Image Denoise, led by albedo and normals of the object. FLIP "
@@ -28,7 +31,7 @@ NOTE = (
 )
 
 
-def reference_image(task: Task, scene: Any, alone: Any = None) -> dict[str, Any]:
+def reference_image(task: Task, scene: mi.Scene, alone: mi.Scene | None = None) -> dict[str, object]:
     """The path traced image of a scene without its noise, and how far two halves of its samples are apart.
 
     Args:
@@ -57,7 +60,7 @@ def reference_image(task: Task, scene: Any, alone: Any = None) -> dict[str, Any]
 
 
 @unmodelled
-def long_reference(task: Task) -> dict[str, Any]:
+def long_reference(task: Task) -> dict[str, object]:
     """`reference_image` of a scanned object; the parameters are material, size, lights, spp, seed and any scan."""
     prepare()
     p = task.params
@@ -84,7 +87,7 @@ def reference_shot(result: Result, label: str = "Path traced") -> tuple[Shot, np
     return Shot(label, np.float32(2.0**stops) * image, numbers), mask, stops
 
 
-def against(reference: tuple[Shot, np.ndarray, float], label: str, image: np.ndarray, **numbers: Any) -> Shot:
+def against(reference: tuple[Shot, np.ndarray, float], label: str, image: np.ndarray, **numbers: float | str) -> Shot:
     """An image beside a reference, exposed alike.
 
     Args:

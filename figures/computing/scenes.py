@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import gc
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from figures.parts.part import Task
+from figures.parts.records import SceneDict
 from figures.parts.store import read_exr
 from halfspace_sss.checks import check_choice
 from halfspace_sss.provenance import check_folder
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 BUNNY = Path(__file__).parent.parent / "assets" / "bunny.ply"
 DRAGON = BUNNY.with_name("dragon.ply")
@@ -51,14 +55,14 @@ def prepare() -> None:
 
 def bunny_scene(
     material: str, size: int, lights: str = "both", model: str = "neural", sampler: str = "independent"
-) -> dict[str, Any]:
+) -> SceneDict:
     """`scan_scene` of the bunny."""
     return scan_scene("bunny", material, size, lights, model, sampler)
 
 
 def scan_scene(
     scan: str, material: str, size: int, lights: str = "both", model: str = "neural", sampler: str = "independent"
-) -> dict[str, Any]:
+) -> SceneDict:
     """A translucent object on its own, as a dict for `rendering.scene_files.load_scene`, under its name.
 
     Args:
@@ -80,7 +84,7 @@ def scan_scene(
     result = SCANS[scan]
     view = mi.ScalarTransform4f().look_at(_beside(result, _EYE), list(result.centre), [0, 1, 0])
     film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
-    scene: dict[str, Any] = {
+    scene: SceneDict = {
         "type": "scene",
         "integrator": {"type": "bssrdf", "mm_per_unit": result.mm_per_unit, "hide_emitters": True},
         "sensor": {"type": "perspective", "fov": 26.0, "to_world": view, "film": film, "sampler": {"type": sampler}},
@@ -136,7 +140,7 @@ def environment_file(name: str) -> Path:
     return Path(__file__).parents[1] / "assets" / f"{name}.exr"
 
 
-def environment(name: str, scale: float = 1.0, turn: float = 0.0) -> dict[str, Any]:
+def environment(name: str, scale: float = 1.0, turn: float = 0.0) -> SceneDict:
     """An environment map as an emitter for `mitsuba.load_dict`.
 
     Args:
@@ -158,7 +162,7 @@ def environment(name: str, scale: float = 1.0, turn: float = 0.0) -> dict[str, A
 SEEDS_APART = 10_000  # of the halves of an image; passes count up from the first seed
 
 
-def long_render(task: Task, scene: Any, spp_per_pass: int, passes: int, half: int = 0) -> dict[str, Any]:
+def long_render(task: Task, scene: mi.Scene, spp_per_pass: int, passes: int, half: int = 0) -> dict[str, object]:
     """The image of a scene with its variance, seconds and samples; what is done of it is kept in the task's folder.
 
     Args:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from figures.computing.references import reference_image
 from figures.computing.scenes import prepare
 from figures.parts.part import Part, Task
+from figures.parts.records import Params, SceneDict
 
 
 class Staging(NamedTuple):
@@ -25,7 +26,7 @@ class Staging(NamedTuple):
     far: float = 4.0  # of the eye; the lamp is at 3
 
 
-def lit_scene(things: dict[str, Any], stage: Staging, size: int, mm_per_unit: float) -> dict[str, Any]:
+def lit_scene(things: SceneDict, stage: Staging, size: int, mm_per_unit: float) -> SceneDict:
     """The scene of a thing, as a dict for `scenes.scene_files.load_scene`.
 
     Args:
@@ -55,7 +56,7 @@ def lit_scene(things: dict[str, Any], stage: Staging, size: int, mm_per_unit: fl
 
 def thing_parts(
     name: str,
-    common: dict[str, Any],
+    common: Params,
     spp: tuple[int, int],
     functions: tuple[Callable, Callable],
     models: Iterable[tuple[str, tuple[Path, ...]]],
@@ -83,7 +84,7 @@ def thing_parts(
     return results
 
 
-def walked(task: Task, scene_of: Callable[[Task], dict[str, Any]]) -> dict[str, Any]:
+def walked(task: Task, scene_of: Callable[[Task], SceneDict]) -> dict[str, object]:
     """`reference_image` of a thing."""
     from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
 
@@ -91,7 +92,7 @@ def walked(task: Task, scene_of: Callable[[Task], dict[str, Any]]) -> dict[str, 
     return reference_image(task, load_scene(scene_of(task), PATH_TRACED))
 
 
-def shown(task: Task, scene_of: Callable[[Task], dict[str, Any]]) -> dict[str, Any]:
+def shown(task: Task, scene_of: Callable[[Task], SceneDict]) -> dict[str, object]:
     """The image of a model by its gathered light."""
     import mitsuba as mi
 

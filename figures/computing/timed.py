@@ -6,13 +6,16 @@ import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from halfspace_sss.backend import clock
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.progress import Progress
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 MOST_LANES = 2**22  # camera rays of a pass, for memory
 COMPILING = 2  # samples per pixel of a render that is not timed: a power of two has the kernels of all others
@@ -51,7 +54,7 @@ class TimedRender:
         return float(np.median(self.pass_cpu_seconds))
 
 
-def gathered_anew(scene: Any) -> float:
+def gathered_anew(scene: mi.Scene) -> float:
     """Gather the light of a scene by `bssrdf` as if it never had been; the CPU seconds that takes."""
     started = clock()
     scene.integrator().gathering = type(scene.integrator().gathering)()
@@ -59,7 +62,7 @@ def gathered_anew(scene: Any) -> float:
     return clock() - started
 
 
-def rendered(scene: Any, spp: int, *seed: int) -> tuple[np.ndarray, float]:
+def rendered(scene: mi.Scene, spp: int, *seed: int) -> tuple[np.ndarray, float]:
     """An image (H, W, 3) and the seconds it took; ValueError if it is not finite.
 
     Of a tuple of scenes the first gives the first channel, and so on; their times add up.
@@ -79,7 +82,7 @@ def rendered(scene: Any, spp: int, *seed: int) -> tuple[np.ndarray, float]:
     return image, seconds
 
 
-def pass_size(scene: Any, seconds: float, seed: int = 0) -> int:
+def pass_size(scene: mi.Scene, seconds: float, seed: int = 0) -> int:
     """Samples per pixel of a pass that takes so many seconds or half as many; its kernels are compiled then.
 
     Args:
@@ -117,7 +120,7 @@ def _samples_in(seconds: float, result: list[tuple[int, float]]) -> int:
 
 
 def alternating(
-    scenes: Mapping[str, Any], spp: Mapping[str, int], seed: int, *, passes: int | None = None,
+    scenes: Mapping[str, mi.Scene], spp: Mapping[str, int], seed: int, *, passes: int | None = None,
     seconds: float | None = None, progress: Progress | None = None,
 ) -> dict[str, TimedRender]:  # fmt: skip
     """Render scenes in turn, a pass of each, until every one has its passes or its seconds.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -13,6 +12,7 @@ from figures.drawing.image_grid import image_grid
 from figures.drawing.labels import label
 from figures.drawing.page import page
 from figures.parts.part import Result
+from figures.parts.records import Row
 from halfspace_sss.comparison.style import paper, saved
 
 
@@ -20,7 +20,7 @@ def image_files(
     figure: str,
     title: str,
     scenes: Mapping[str, Sequence[Shot]],
-    rows: Sequence[Mapping[str, Any]],
+    rows: Sequence[Row],
     notes: str,
     printed: Sequence[str] = (FLIP,),
 ) -> dict[str, bytes | str]:
@@ -44,7 +44,7 @@ def image_files(
     return files
 
 
-def rows_of(scenes: Mapping[str, Sequence[Shot]], key: str) -> list[dict[str, Any]]:
+def rows_of(scenes: Mapping[str, Sequence[Shot]], key: str) -> list[Row]:
     """Rows of the table of a figure: the numbers of each image but the references; `key` is what a scene is called."""
     return [{key: name, "model": shot.label, **shot.numbers} for name, shots in scenes.items() for shot in shots[1:]]
 

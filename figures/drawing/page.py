@@ -9,13 +9,14 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from importlib import resources
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib import colormaps  # without it there is no page, which must be known before one is drawn
 
 from figures.computing.images import FLIP, RELATIVE_MSE, Shot, compared, denoised, guides
 from full_geometry.trade.image_differences import srgb
+from halfspace_sss.provenance import JsonDict
 
 if TYPE_CHECKING:
     from full_geometry.inverse.comparing import MaterialFit
@@ -96,13 +97,13 @@ def _check(name: str, shots: Sequence[Shot]) -> None:
                 raise ValueError(f"{kind} of {shot.label!r} in {name!r} must have the size {size}, got {pixels.shape}")
 
 
-def _scene(name: str, shots: Sequence[Shot], exposure: float) -> dict[str, Any]:
+def _scene(name: str, shots: Sequence[Shot], exposure: float) -> JsonDict:
     height, width = np.shape(shots[0].image)[:2]
     return {"name": name, "size": [width, height], "shots": [_shot(shot, exposure) for shot in shots]}
 
 
-def _shot(shot: Shot, exposure: float) -> dict[str, Any]:
-    results: dict[str, Any] = {"label": shot.label, "why": shot.why, "numbers": {}}
+def _shot(shot: Shot, exposure: float) -> JsonDict:
+    results: JsonDict = {"label": shot.label, "why": shot.why, "numbers": {}}
     for column, value in shot.numbers.items():
         plain = value if isinstance(value, str) else float(value)
         results["numbers"][column] = plain if isinstance(plain, str) or math.isfinite(plain) else str(plain)
@@ -121,7 +122,7 @@ def _colors(name: str) -> np.ndarray:
     return np.round(255 * colormaps[name](np.arange(256))[:, :3]).astype(np.uint8)
 
 
-def _map(kind: str) -> dict[str, Any]:
+def _map(kind: str) -> JsonDict:
     """What the legend of a map shows."""
     title, name, ends = MAPS[kind]
     colors = ["#" + bytes(color).hex() for color in _colors(name)[::17]]
@@ -150,7 +151,7 @@ def _lossy(pixels: np.ndarray, quality: int) -> str:
     return _address(pixels, "jpeg", quality=quality, subsampling=0, optimize=True)
 
 
-def _address(pixels: np.ndarray, kind: str, **settings: Any) -> str:
+def _address(pixels: np.ndarray, kind: str, **settings: bool | int) -> str:
     from PIL import Image
 
     buffer = io.BytesIO()

@@ -6,10 +6,10 @@ Texture coordinates are the azimuth about y, 0.5 in front, and the height; the s
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from figures.parts.records import SceneDict
 from full_geometry.learning.meshes import Box, Mesh, capsule, cut, ellipsoid, join, overlap, smoothstep, surface
 
 BOX = Box((-1.3, -2.1, -1.5), (1.3, 1.6, 1.6))
@@ -94,7 +94,7 @@ def paint() -> np.ndarray:
     return over(result, (0.16, 0.09, 0.05), hair - y)
 
 
-def write_painted(mesh: Mesh, path: Path) -> dict[str, Any]:
+def write_painted(mesh: Mesh, path: Path) -> SceneDict:
     """The head as a shape of `mitsuba.load_dict`, its file written, and the paint as a texture: "shape" and "paint"."""
     import mitsuba as mi
 

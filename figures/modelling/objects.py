@@ -6,12 +6,12 @@ import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from figures.modelling import varying
 from figures.modelling.candle import make_candle
+from figures.parts.records import SceneDict
 from full_geometry.learning.meshes import Box, Mesh, in_chunks, surface
 from halfspace_sss.materials.files import parse
 from halfspace_sss.materials.material import Material
@@ -60,14 +60,14 @@ class Grid:
         if not (self.albedo.min() >= 0 and self.albedo.max() <= 1):
             raise ValueError(f"albedo must be in [0, 1], got {self.albedo.min()} to {self.albedo.max()}")
 
-    def volumes(self) -> dict[str, Any]:
+    def volumes(self) -> SceneDict:
         """Grid volumes of Mitsuba, by name: "sigma_t" with one channel, "albedo" with three."""
         import mitsuba as mi
 
         arrays = {"sigma_t": self.sigma_t[..., None], "albedo": self.albedo}
         return {name: mi.VolumeGrid(np.ascontiguousarray(v, dtype=np.float32)) for name, v in arrays.items()}
 
-    def write(self, folder: Path, name: str) -> dict[str, Any]:
+    def write(self, folder: Path, name: str) -> SceneDict:
         """Write FOLDER/NAME_sigma_t.vol and ..._albedo.vol, and return the volumes that read them, by name."""
         import mitsuba as mi
 
@@ -156,7 +156,7 @@ def make_varying(name: str, resolution: int = 192, grid_resolution: int = 160, s
     return Varying(name, mesh, grid, ETA[name])
 
 
-def candle_parts(folder: Path, resolution: int = 192, seed: int = 0, model: str = "neural") -> dict[str, Any]:
+def candle_parts(folder: Path, resolution: int = 192, seed: int = 0, model: str = "neural") -> SceneDict:
     """The candle: "candle" with the surface `translucent`, "wick", and "flame", an area light in the bowl; mm.
 
     Args:
@@ -179,7 +179,7 @@ def candle_parts(folder: Path, resolution: int = 192, seed: int = 0, model: str 
     }
 
 
-def learnable_parts(result: Varying, folder: Path, model: str = "full_geometry") -> dict[str, Any]:
+def learnable_parts(result: Varying, folder: Path, model: str = "full_geometry") -> SceneDict:
     """An object whose medium varies with the surface `translucent` and a smooth boundary, so that it can be learnt; mm.
 
     Args:

@@ -22,13 +22,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
 
+from figures.parts.records import SceneDict
 from figures.rivals.photographs import Studio
 from full_geometry.geometry.mesh import face_vertices, vertex_positions
 from halfspace_sss.progress import Progress
@@ -51,8 +51,8 @@ class DengTextures:
 
 
 def painted(
-    part: dict[str, Any], path: Path, eta: float, textures: DengTextures | None = None, reflection: bool = True
-) -> dict[str, Any]:
+    part: SceneDict, path: Path, eta: float, textures: DengTextures | None = None, reflection: bool = True
+) -> SceneDict:
     """A mesh from a file as the model has it, with its textures; without them those of the start.
 
     Args:

@@ -18,9 +18,9 @@ Scattering, arXiv 2312.15711.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import count
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -115,7 +115,7 @@ def distant_walks(obj: TranslucentObject, exits: SurfacePoint, seed: tuple[int, 
     return DistantWalks(np.stack(columns, axis=1), np.stack(_numbers(T, n), axis=1))
 
 
-def _numbers(values: Any, n: int) -> list[np.ndarray]:
+def _numbers(values: Sequence[mi.Float], n: int) -> list[np.ndarray]:
     return [np.broadcast_to(np.array(v, dtype=np.float32), n) for v in values]
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import count
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -43,7 +42,7 @@ class SpaceFlow:
         frame: of the object.
     """
 
-    flow: Any
+    flow: zuko.flows.Flow
     frame: ObjectFrame
 
     def sample(self, exits: SurfacePoint, n: int, seed: int = 0) -> np.ndarray:

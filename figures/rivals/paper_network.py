@@ -6,7 +6,6 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import count
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -253,7 +252,7 @@ def uniform_samples(
     obj: TranslucentObject, frame: ObjectFrame, exits: SurfacePoint, n: int, seed: tuple[int, ...]
 ) -> PaperSamples:
     """N points uniform over the area for each exit; the throughputs are left out."""
-    m: Any = dr.width(exits.p)
+    m: int = dr.width(exits.p)
     at = obj.random_points(generator(mi, m * n, pass_seed(*seed)))
     w = np.array(at.w, dtype=np.float32).T.reshape(m, n, 3)
     points = placed(frame, at, m * n).reshape(m, n, 5)

@@ -6,12 +6,11 @@ chance finds.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from figures.parts.records import SceneDict
 from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
 
 FAR, FOV = 5.0, 24.0  # distance of cameras over the radius of the object; degrees
@@ -59,9 +58,7 @@ class Studio:
         model: a model, or `PATH_TRACED`.
     """
 
-    def __init__(
-        self, parts: Mapping[str, Any], name: str, size: int, n: int, seed: int, model: str = PATH_TRACED
-    ) -> None:
+    def __init__(self, parts: SceneDict, name: str, size: int, n: int, seed: int, model: str = PATH_TRACED) -> None:
         import mitsuba as mi
 
         film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}, "pixel_format": "rgb"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import matplotlib as mpl
 from matplotlib.backends.backend_pdf import FigureCanvasPdf
@@ -20,7 +20,7 @@ class Look(NamedTuple):
 
     label: str
     color: str
-    dash: Any
+    dash: str | tuple[float, tuple[float, ...]]
 
 
 # Okabe and Ito's colours, which stay apart in the common kinds of colour blindness; relatives share a hue family
