@@ -31,8 +31,11 @@ class DiffuseBoundary:
         return (1 - self.C_E) / (2 * self.C_phi)
 
     @staticmethod
-    def of(eta: float, moments: str = "exact") -> DiffuseBoundary:
-        """With moments by quadrature ("exact"), or by the polynomials printed in papers ("published", eta <= 2.5)."""
+    def for_index(eta: float, moments: str = "exact") -> DiffuseBoundary:
+        """The boundary of a relative index.
+
+        moments: by quadrature ("exact"), or by the polynomials printed in papers ("published", eta <= 2.5).
+        """
         check_choice("moments", moments, MOMENTS)
         if moments == "exact":
             return DiffuseBoundary(fresnel.C_phi(eta), fresnel.C_E(eta), 4 * fresnel.C_phi(1 / eta))

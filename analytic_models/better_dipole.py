@@ -34,7 +34,7 @@ class BetterDipole(Separable):
     def __init__(self, medium: Medium, *, moments: str = "exact") -> None:
         super().__init__(medium)
         self.moments = moments
-        self._boundary = DiffuseBoundary.of(medium.eta, moments)
+        self._boundary = DiffuseBoundary.for_index(medium.eta, moments)
         self._c = Grosjean(medium, self._boundary)
 
     @property

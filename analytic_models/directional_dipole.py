@@ -54,7 +54,7 @@ class DirectionalDipole(BSSRDF):
     def __init__(self, medium: Medium, *, moments: str = "exact") -> None:
         super().__init__(medium)
         self.moments = moments
-        self._boundary = DiffuseBoundary.of(medium.eta, moments)
+        self._boundary = DiffuseBoundary.for_index(medium.eta, moments)
         self._c = _Coefficients(medium, self._boundary)
 
     def G(self, q: Query) -> Real:

@@ -50,7 +50,7 @@ class PhotonBeamDiffusion(BSSRDF):
             raise ValueError(f"n_samples must be an integer in [2, 1000], got {n_samples!r}")
         check_choice("kappa", kappa, KAPPAS)
         self.n_samples, self.kappa, self.moments = n_samples, kappa, moments
-        self._boundary = DiffuseBoundary.of(medium.eta, moments)
+        self._boundary = DiffuseBoundary.for_index(medium.eta, moments)
         self._c = Grosjean(medium, self._boundary)
         self._kappa_rate = 2 * (self._c.sigma_t_prime if kappa == "reduced" else 1 + 0 * self._c.sigma_t_prime)
 

@@ -129,6 +129,7 @@ def model_error(model: BSSRDF, reference: TracedMaps, within: tuple[float, float
         reference: traced with seeds that the model was not trained with.
         within: smallest and largest distance that counts, mean free paths; by default all.
     """
+    # energies of both halves of the reference and of the model in blocks of cells
     halves, E = reference.energies(), reference.model_energies(model)
     if within is not None:
         radii = reference.block_radii()
@@ -138,9 +139,11 @@ def model_error(model: BSSRDF, reference: TracedMaps, within: tuple[float, float
     if model.orders == "total":
         traced = traced + reference.single_energies() * (1 if within is None else counts)
     total = float(traced.sum() or E.sum() or 1.0)  # a medium that does not scatter has none
+    # raw = sum |E - E_t| / sum E_t, and the same of half the difference of the halves, which is noise alone
     deviation, noise = np.abs(E - traced), 0.5 * np.abs(halves[:, 0] - halves[:, 1])
     raw, blur = float(deviation.sum() / total), float(noise.sum() / total)
     bias_noise = float(0.5 * abs(halves[:, 0].sum() - halves[:, 1].sum()) / total)
+    # the error of each decade of r, noise taken out: sqrt(raw² - noise²)
     decades = {}
     decade = np.floor(np.log10(reference.block_radii())).astype(int)
     for d in np.unique(decade):

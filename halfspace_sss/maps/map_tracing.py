@@ -93,12 +93,14 @@ class MapTally:
     def scatter(self, sums: tuple, event: Scatter) -> tuple:
         import drjit as dr
 
+        # contributions towards all observations, q_k = p(d . d_k) exp(-z / mu_k) / (eta² mu_k)
         q = []
         for ox, oy, mu, inverse_mu, scale in self.directions:
             cosine = event.dx * ox + event.dy * oy - event.dz * mu
             q.append(scale * self.phase(cosine, event) * dr.exp(-event.z * inverse_mu))
         total = sum(q[1:], q[0])
         for hit in range(HITS):
+            # draw one of them by q_k / sum q, and score the sum in the cell where it leaves
             target = (event.random() + hit) / HITS * total
             k, (ox, oy, inverse_mu) = self._choose(q, target)
             t = event.z * inverse_mu

@@ -131,14 +131,17 @@ def _check(g: float, mu_i: float | str) -> None:
 def _modes(albedo: float, g: float, eta: float) -> _Modes:
     basis = _basis(eta)
     n = len(basis.mu)
+    # delta-M: the share g^n of the peak counts as unscattered
     peak = g**n
     lost = (1 - albedo) / (1 - albedo * peak)  # 1 - a
     order = np.arange(n)
     a_beta = (1 - lost) * (2 * order + 1) * (float(g) ** order - peak) / (1 - peak)
+    # factors of A - B = V^-½ F F^T V^½ and A + B = V^-½ G G^T V^½
     root = 1 / np.sqrt(basis.mu)[:, None]
     C = np.linalg.cholesky(np.eye(n - 1) - (basis.turned * a_beta[2::2]) @ basis.turned.T)
     F = root * np.column_stack([math.sqrt(lost) * basis.alike, basis.others @ C])
     G = root * np.linalg.cholesky(np.eye(n) - (basis.odd * a_beta[1::2]) @ basis.odd.T)
+    # modes: G^T F = X diag(k) Y^T, s = V^-½ G X, d = V^-½ F Y
     X, k, Y = np.linalg.svd(G.T @ F)
     scale = 1 / np.sqrt(basis.w * basis.mu)[:, None]
     return _Modes(scale * (G @ X), scale * (F @ Y.T), k, a_beta)

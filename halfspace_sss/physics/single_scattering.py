@@ -223,14 +223,17 @@ def exitance(medium: Medium, r: Real, mu_i: Real = 1.0, phi: Real = 0.0) -> Real
     eta = medium.eta
     tau = lib.constant(medium.sigma_t, r) * r
     a, sine, cos_phi = mu_internal(mu_i, eta), _sine(lib, mu_i, eta), lib.cos(phi)
+    # the line of the refracted beam: distance b = r h of the point of exit from it, and the foot of its perpendicular
     foot = sine * cos_phi  # of the perpendicular from the point to the beam, in units of r
     h = lib.maximum(lib.sqrt(a * a + (sine * lib.sin(phi)) * (sine * lib.sin(phi))), TINY)
+    # the beam is seen from where total reflection ends, at the largest angle e_max between beam and exit ray
     start = _critical_length(lib, eta, mu_i, foot)
     d_start = lib.sqrt((start - foot) * (start - foot) + h * h)
     e_max = lib.arctan2(h, start - foot)
     g = lib.constant(medium.g, r)
     total = 0.0 * tau
     for x, rest, w in zip(*(v.tolist() for v in _graded(20, 26, 8))):
+        # at the angle e: distance d to the point of exit, length t of the beam, cosine theta of the exit ray
         sin_e = lib.maximum(lib.sin(e_max * rest), TINY)
         d = h / sin_e
         t = start + d_start * lib.sin(e_max * x) / sin_e

@@ -241,6 +241,7 @@ def _step(s: dict, m: _Constants, start: tuple, lane, tally: _Tally) -> dict:
         dr.gather(Float, table, layer)
         for table in (m.inverse_sigma_t, m.albedo, m.lost, m.g, m.thickness, m.eta_up, m.eta_down)
     )
+    # draw a free path, p(s) = sigma_t exp(-sigma_t s), and end it at the interface that it meets
     mu, down = dr.abs(dz), dz > 0
     free = -dr.log(1 - rng.next_float32()) * inverse
     gap = dr.select(down, thickness - z, z) / dr.maximum(mu, 1e-12)
@@ -248,23 +249,27 @@ def _step(s: dict, m: _Constants, start: tuple, lane, tally: _Tally) -> dict:
     t = dr.minimum(free, gap)
     x, y, z = x + dx * t, y + dy * t, z + dz * t
 
+    # tally what leaves at an outer boundary, w (1 - F_r), or what a scattering event absorbs, w (1 - albedo)
     eta = dr.select(down, eta_down, eta_up)
     F = F_r(mu, eta)
     outer = crosses & dr.select(down, layer == m.last, layer == 0)
     event = Boundary(s["order"], dr.select(outer, s["weight"] * (1 - F), 0.0), x, y, mu, None, lane)
     tally.event(event, crosses, down, s["deepest"], layer, s["weight"] * lost)
 
+    # cross an interface inside with the probability 1 - F_r: sines over eta, by Snell
     u, azimuth = rng.next_float32(), 2 * math.pi * rng.next_float32()
     refracts = crosses & ~outer & (u >= F)
     layer = dr.select(refracts, dr.select(down, layer + 1, layer - 1), layer)
     bottom = dr.gather(Float, m.thickness, layer)  # of the layer that the path goes on in
     z = dr.select(crosses, dr.select(down ^ refracts, bottom, 0.0), dr.maximum(z, 0.0))
+    # else be reflected with w F_r at an outer boundary, w at one inside; or scatter with w albedo
     tx, ty, tz = turn(dx, dy, dz, sample_hg(u, g), azimuth)
     shrink, along = dr.select(refracts, 1 / eta, 1.0), dr.select(refracts, mu_internal(mu, eta), mu)
     dx, dy = dr.select(crosses, dx * shrink, tx), dr.select(crosses, dy * shrink, ty)
     dz = dr.select(crosses, dr.select(down ^ refracts, -along, along), tz)
     weight = s["weight"] * dr.select(crosses, dr.select(outer, F, 1.0), albedo)
 
+    # play Russian roulette; a lane whose walk ends begins the next one
     step = s["step"] + 1
     survive, weight = roulette(weight, step)
     ends = rng.next_float32() >= survive

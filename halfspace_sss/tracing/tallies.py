@@ -184,16 +184,19 @@ class LineTally:
         import drjit as dr
 
         ox, oy, mu, inverse_mu, scale = self.angular.constants[0]
+        # connect the event with the surface along the refracted w_o: t = z / mu_o'
         t = event.z * inverse_mu
         x, y = event.x + t * ox, event.y + t * oy
         cell, active = find_cell(self.edges2, x * x + y * y)
         active &= event.order > 1
+        # keep what lies in the sector |psi - line| < half width
         if self.symmetry != "rotation":
             psi = dr.atan2(dr.abs(y) if self.symmetry == "mirror" else y, x)
             off = psi - self.line
             off = dr.abs(off - 2 * math.pi * dr.round(off / (2 * math.pi)))
             active &= off < self.half_width
         cosine = event.dx * ox + event.dy * oy - event.dz * mu
+        # score w p(d . d_o) exp(-t) / (eta² mu_o')
         score = event.weight * scale * eval_hg(cosine, self.angular.g) * dr.exp(-t)
         self.cells.add(score, cell, event.lane, active)
         return sums

@@ -90,7 +90,7 @@ class WalkConstants:
     matched: bool  # eta = 1 in every lane
 
     @classmethod
-    def of(cls, types: ModuleType, medium: Medium) -> WalkConstants:
+    def uniform(cls, types: ModuleType, medium: Medium) -> WalkConstants:
         """One scalar medium for all lanes."""
         import drjit as dr
 
@@ -236,7 +236,7 @@ def walk(
 
     Float, UInt32 = types.Float, types.UInt32
     lanes = dr.width(mu_in)
-    constants = medium if isinstance(medium, WalkConstants) else WalkConstants.of(types, medium)
+    constants = medium if isinstance(medium, WalkConstants) else WalkConstants.uniform(types, medium)
     constants.check_lanes(lanes)
     mu_in = dr.clip(mu_in, 1e-6, 1.0)
     sin_in = dr.sqrt(dr.maximum((1 - mu_in) * (1 + mu_in), 0.0))
@@ -282,7 +282,9 @@ def _step(s: dict, sums: tuple, m: WalkConstants, start: tuple, lane: Lanes, tal
     rng = s["rng"]
     Float, UInt32 = type(s["z"]), type(s["order"])
     x, y, z, dx, dy, dz = (s[k] for k in ("x", "y", "z", "dx", "dy", "dz"))
+    # draw a free path, p(s) = exp(-s)
     path = -dr.log(1 - rng.next_float32())
+    # where it meets the boundary, w (1 - F_r) leaves at the distance t = z/mu, and w F_r is reflected
     below = z + dz * path
     crosses = below < 0
     mu = dr.abs(dz)
@@ -294,6 +296,7 @@ def _step(s: dict, sums: tuple, m: WalkConstants, start: tuple, lane: Lanes, tal
 
     # a reflected free path goes on downwards by what is left of it: the mirror image of the straight one
     x, y, z, dz = x + dx * path, y + dy * path, dr.abs(below), dr.select(crosses, -dz, dz)
+    # scatter: w <- w albedo
     weight = dr.select(crosses, s["weight"] * F, s["weight"]) * m.albedo
     order = s["order"] + 1
     event = Scatter(
@@ -302,11 +305,13 @@ def _step(s: dict, sums: tuple, m: WalkConstants, start: tuple, lane: Lanes, tal
     )  # fmt: skip
     sums = tuple(tally.scatter(state, event) for tally, state in zip(tallies, sums))
 
+    # turn by Henyey and Greenstein's phase function, the azimuth uniform
     u, azimuth = rng.next_float32(), 2 * math.pi * rng.next_float32()
     cosine = 2 * u - 1 if m.isotropic else sample_hg(u, m.g)
     first = dr.select(order == 1, cosine, s["first"])
     dx, dy, dz = turn(dx, dy, dz, cosine, azimuth)
 
+    # play Russian roulette, w <- w / P(survive); a lane whose walk ends begins the next one
     survive, weight = roulette(weight, order)
     ends = rng.next_float32() >= survive
 

@@ -104,7 +104,7 @@ def test_beam_diffusion_differs_from_pbrt_only_by_its_choices(truths):
     for numbers, row in regression(truths, "pbrt-v3 E_d"):
         medium = row_medium(numbers, row)
         model = PhotonBeamDiffusion(medium, kappa="reduced")
-        R_ms = math.pi * DiffuseBoundary.of(medium.eta).N * model.eval(numbers["r"], 1.0, 0.0, 1.0, 0.0)
+        R_ms = math.pi * DiffuseBoundary.for_index(medium.eta).N * model.eval(numbers["r"], 1.0, 0.0, 1.0, 0.0)
         R_ms /= F_t(1.0, medium.eta) ** 2
         assert R_ms == pytest.approx(float(row["value"]), rel=2e-3 if numbers["r"] >= 1 else 0.05), row["id"]
 
@@ -155,7 +155,7 @@ def test_standard_dipole_has_its_closed_plane_integral(model, medium):
 
 def modified_diffusion_bracket(medium: Medium) -> tuple[float, float]:
     """C_phi (1 - e^-4Ax)/x + C_E (1 + e^-4Ax) with x = sigma_tr D; and sigma_tr / sigma_t'."""
-    a, b = medium.albedo_prime, DiffuseBoundary.of(medium.eta)
+    a, b = medium.albedo_prime, DiffuseBoundary.for_index(medium.eta)
     x = math.sqrt((1 - a) * (2 - a) / 3)
     decay = math.exp(-4 * boundary_A(medium.eta) * x)
     return b.C_phi * (1 - decay) / x + b.C_E * (1 + decay), math.sqrt(3 * (1 - a) / (2 - a))
@@ -181,7 +181,7 @@ def test_beam_diffusion_without_kappa_has_its_closed_plane_integral(medium, mu_i
 
     def ring(r: np.ndarray) -> np.ndarray:
         S = model.eval(r[:, None], mu_i, phi, 1.0, 0.0).mean(axis=1)
-        return math.pi * DiffuseBoundary.of(medium.eta).N * S / (F_t(mu_i, medium.eta) * F_t(1.0, medium.eta))
+        return math.pi * DiffuseBoundary.for_index(medium.eta).N * S / (F_t(mu_i, medium.eta) * F_t(1.0, medium.eta))
 
     # the clamp at r = 1e-6 takes less than 1e-6 of a profile that grows as 1/r
     assert plane_integral(ring, 1 / medium.sigma_t_prime) == pytest.approx(expected, rel=2e-6)
@@ -189,7 +189,7 @@ def test_beam_diffusion_without_kappa_has_its_closed_plane_integral(medium, mu_i
 
 def beam_integrand(model: PhotonBeamDiffusion, r: float, mu_in: float, phi_i: float, t: float) -> float:
     """R_ms' integrand as printed, term by term, lengths in mean free paths."""
-    m, b = model.medium.in_mfp(), DiffuseBoundary.of(model.medium.eta)
+    m, b = model.medium.in_mfp(), DiffuseBoundary.for_index(model.medium.eta)
     D = (2 * m.sigma_a + m.sigma_s_prime) / (3 * m.sigma_t_prime**2)
     a, z_b, z = math.sqrt(m.sigma_a / D), 2 * b.A * D, t * mu_in
     s = math.sqrt(1 - mu_in**2)
@@ -216,7 +216,7 @@ def test_beam_diffusion_converges_to_adaptive_quadrature(medium, n_samples, rel)
                 for e in zip(ends[:-1], ends[1:])
             ]
             S = model.eval(r / medium.sigma_t, mu_i, phi_i, 1.0, 0.0) / medium.sigma_t**2
-            S *= math.pi * DiffuseBoundary.of(medium.eta).N / (F_t(mu_i, medium.eta) * F_t(1.0, medium.eta))
+            S *= math.pi * DiffuseBoundary.for_index(medium.eta).N / (F_t(mu_i, medium.eta) * F_t(1.0, medium.eta))
             assert pytest.approx(sum(pieces), rel=rel) == S, (r, mu_i)
 
 
@@ -293,6 +293,6 @@ def test_directional_dipole_gains_energy_as_documented():
     """Reflectance / T_12 for albedo -> 1: 1.34, 1.24, 1.19 at eta = 1, 1.3, 1.5."""
     for eta, expected in ((1.0, 1.34), (1.3, 1.24), (1.5, 1.19)):
         model = DirectionalDipole(Medium(1.0, 1e-9, 0.0, eta))
-        lobe = math.pi * DiffuseBoundary.of(eta).N / F_t(1.0, eta) ** 2
+        lobe = math.pi * DiffuseBoundary.for_index(eta).N / F_t(1.0, eta) ** 2
         total = plane_integral(lambda r: lobe * model.eval(r, 1.0, 0.0, 1.0, 0.0), 1.0)  # noqa: B023
         assert total == pytest.approx(expected, abs=0.01)

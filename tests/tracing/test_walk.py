@@ -48,7 +48,8 @@ def test_one_medium_per_lane_gives_the_walks_of_that_medium():
     types, m = array_types(), Medium.from_albedo(0.8, 1.0, 0.3, 1.4)
     beam, seed = types.Float(np.full(256, 0.9)), pass_seed(7)
     lanes = WalkConstants.per_lane(types, *(np.full(256, v) for v in (0.8, 0.3, 1.4)))
-    runs = [walk(types, c, beam, 8, seed, [FluxTally(types)])[0][0] for c in (m, WalkConstants.of(types, m), lanes)]
+    media = (m, WalkConstants.uniform(types, m), lanes)
+    runs = [walk(types, c, beam, 8, seed, [FluxTally(types)])[0][0] for c in media]
     one, opaque, many = (np.stack([v.numpy() for v in run]) for run in runs)
     assert np.array_equal(one, opaque) and np.array_equal(one, many)
 
