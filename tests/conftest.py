@@ -63,7 +63,7 @@ def pytest_collection_finish() -> None:
     """
     path = os.environ.get("DRJIT_LIBLLVM_PATH")
     if path and "drjit" in sys.modules and os.environ.get("DRJIT_CACHE_DIR") == str(QUICKLY):
-        options = (ctypes.c_char_p * 2)(b"tests", b"-opt-bisect-limit=0")
+        options = (ctypes.c_char_p * 3)(b"tests", b"-opt-bisect-limit=0", b"-opt-bisect-verbose=false")
         ctypes.CDLL(path).LLVMParseCommandLineOptions(len(options), options, None)
     gc.freeze()
 
