@@ -34,6 +34,9 @@ def draw(table: pandas.DataFrame) -> Figure:
                         shown = f"{label}, {kind}" if column == row == 0 else None
                         ax.loglog(curve.index, curve.values, style, color=colour, marker="o", ms=3, label=shown)
                 ax.grid(True, which="both", lw=0.3, alpha=0.5)
+            times = sorted(set(rows["seconds"]))
+            axes[1][column].set_xticks(times, [f"{value:g}" for value in times])
+            axes[1][column].minorticks_off()
             axes[0][column].set_title(f"{name}, {light}", fontsize=8)
             axes[1][column].set_xlabel("CPU seconds")
         axes[0][0].set_ylabel("error of pixels, %")
