@@ -113,6 +113,17 @@ def variant_channels() -> int:
     return CHANNELS[variant.rpartition("_")[2]]
 
 
+def check_variant() -> None:
+    """ValueError if no variant of Mitsuba is set, before anything of Mitsuba is asked that would then not be there."""
+    import mitsuba as mi
+
+    if mi.variant() is None:
+        raise ValueError(
+            "a variant of Mitsuba must be set before a scene is looked at, got none: "
+            "`mitsuba.set_variant('llvm_ad_rgb')`, then `full_geometry.register()`"
+        )
+
+
 # --------------------------------------------------------------------------------------------------
 # The names of parameters that plugins take: one that none takes is refused.
 

@@ -172,7 +172,8 @@ class _DrJitLibrary:
         def body(k: Lanes, *state: Lanes) -> tuple:
             return k + 1, *f(*state, *(dr.gather(kind, column, k) for column in columns))
 
-        return dr.while_loop((zero, *state), lambda k, *_: k < n, body, label="fold")[1:]
+        # derivatives backwards store the states of n rounds
+        return dr.while_loop((zero, *state), lambda k, *_: k < n, body, label="fold", max_iterations=n)[1:]
 
     def stack(self, values: list) -> Lanes:
         raise ValueError("a Dr.Jit query is answered by a medium of one channel: use medium.channel(k)")
@@ -190,6 +191,11 @@ def _torch_library() -> _TorchLibrary:
 @once
 def _drjit_library() -> _DrJitLibrary:
     return _DrJitLibrary()
+
+
+def asks_nothing(lib: Library, args: tuple) -> bool:
+    """Whether a Dr.Jit array of a query is empty, beside which Dr.Jit refuses numbers; arrays of others may be."""
+    return isinstance(lib, _DrJitLibrary) and any(lib.dr.width(a) == 0 for a in args)
 
 
 def is_torch(lib: Library) -> bool:
@@ -234,7 +240,7 @@ def _common_float(lib: Library, args: tuple, names: Sequence[str] = ()) -> tuple
         return tuple(torch.as_tensor(a, dtype=dtype, device=tensors[0].device) for a in args)
     dr = lib.dr
     arrays = [a for a in args if dr.is_array_v(a)]
-    total = functools.reduce(operator.add, arrays)
+    total = functools.reduce(operator.add, (dr.zeros(type(a)) for a in arrays))  # of their common type
     kind = type(total) if dr.is_float_v(total) else dr.float32_array_t(type(total))
     return tuple(kind(a) for a in args)
 

@@ -40,6 +40,7 @@ from full_geometry.inverse.comparing import (
 from full_geometry.inverse.parameters import FitParameters, check_derivatives, translucent_object
 from full_geometry.inverse.views import GivenView, check_views
 from full_geometry.scenes.scene_files import PATH_TRACED, open_scene
+from full_geometry.settings import check_variant
 from full_geometry.surface.wrapped import surface_of
 from halfspace_sss.progress import ProgressText
 from halfspace_sss.provenance import check_folder
@@ -77,6 +78,7 @@ def fit(
         ValueError: an argument is out of range, views do not belong to the scene, none shows the object, images by
             the model have no derivatives, or `work` is that of another fit.
     """
+    check_variant()
     settings = settings or FitSettings()
     if not isinstance(scene, mi.Scene):
         walks = {"light": "sampled"} if model == WALK else {}  # as derivatives are, with the same bits in each run

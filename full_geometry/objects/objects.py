@@ -50,6 +50,7 @@ from full_geometry.geometry.shape import (
 )
 from full_geometry.geometry.snapshot import Snapshot
 from full_geometry.objects.inclusions import Inclusion, find_inclusions, place_of
+from full_geometry.settings import check_variant
 from full_geometry.surface.medium_derivatives import MediumDerivatives
 from full_geometry.surface.spectral import MediumByWavelength
 from full_geometry.surface.textured import TexturedMedium
@@ -460,6 +461,7 @@ def object_of(
             to both sides, it is an instance or has inside what cannot be learnt. The medium is missing or has other
             channels than the variant, or mm_per_unit is not a finite number > 0.
     """
+    check_variant()
     if mi.is_spectral:
         raise ValueError(f"variant must be RGB or mono for an object to be learnt, got {mi.variant()}")
     if not isinstance(shape, mi.Scene):

@@ -26,6 +26,7 @@ from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.objects.objects import translucent_shapes
 from full_geometry.scenes.reference_store import BY_CHANCE, CHANNELS, Reference, load, save
 from full_geometry.scenes.scene_files import first_cause
+from full_geometry.settings import check_variant
 from full_geometry.surface.wrapped import surface_of
 from halfspace_sss.checks import check_count
 from halfspace_sss.locks import one_writer
@@ -69,6 +70,7 @@ def render(
         ValueError: an argument is out of range, the file is damaged, of another render or written by another run, or a
             pass has values that are not finite.
     """
+    check_variant()
     until = Limits(**limits)
     check_count("seed", seed, 0)
     path = Path(path)

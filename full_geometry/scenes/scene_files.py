@@ -17,7 +17,7 @@ import mitsuba as mi
 
 from full_geometry.capabilities import PATH_TRACED
 from full_geometry.integrators.bssrdf import is_bssrdf
-from full_geometry.settings import LIGHTS, ORDERS, SHARED, WALK_LIGHTS
+from full_geometry.settings import LIGHTS, ORDERS, SHARED, WALK_LIGHTS, check_variant
 from full_geometry.surface.wrapped import surface_of
 from full_geometry.transport.models import model_names, of_objects
 from halfspace_sss.interrupts import is_interrupt
@@ -237,6 +237,7 @@ def _made(scene: dict | str | Path, state: Any, config: Any) -> Any:
 
 
 def _parsed(scene: dict | str | Path, parameters: Mapping[str, str]) -> tuple[Any, Any]:
+    check_variant()
     config = mi.parser.ParserConfig(mi.variant())
     config.parallel = False  # objects then have the same numbers each time, and kernels are found in Dr.Jit's cache
     if not isinstance(scene, dict) and not Path(scene).is_file():

@@ -16,6 +16,7 @@ from full_geometry.integrators.gathering import Gathering
 from full_geometry.objects.objects import KnowsUnit, millimetres, refuse_instances, translucent_shapes
 from full_geometry.objects.small_emitters import is_delta
 from full_geometry.scenes.scene_files import PATH_TRACED, load_objects
+from full_geometry.settings import check_variant
 from full_geometry.trade.smoothed_environment import SmoothedEnvironment
 from full_geometry.transport.models import model_names
 from halfspace_sss.checks import check_choice
@@ -185,11 +186,7 @@ def stage(scene: mi.Scene | dict[str, Any] | str | Path, parameters: dict[str, s
     Raises:
         ValueError: as `load_objects`; there is no translucent object or no sensor, or it is an instance.
     """
-    if mi.variant() is None:
-        raise ValueError(
-            "a variant of Mitsuba must be set before a scene is looked at, got none: "
-            "`mitsuba.set_variant('llvm_ad_rgb')`, then `full_geometry.register()`"
-        )
+    check_variant()
     loaded = scene if isinstance(scene, mi.Scene) else load_objects(scene, parameters)
     shapes = translucent_shapes(loaded)
     if not shapes:

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from halfspace_sss.arrays import broadcast_query
+from halfspace_sss.arrays import asks_nothing, broadcast_query
 from halfspace_sss.checks import check_query
 from halfspace_sss.interface.gradient_blocks import recorded_in_blocks
 from halfspace_sss.interface.query import Query
@@ -107,6 +107,8 @@ class BSSRDF(abc.ABC):
     def _S(self, G_of: Callable[[Query], Any], *query: Any) -> Any:
         """sigma_t² T_12 T_21 G_of(query)."""
         lib, args = broadcast_query(*query, names=("r", "mu_i", "phi_i", "mu_o", "phi_o"))
+        if asks_nothing(lib, args):
+            return type(args[0])()
         args = check_query(lib, args, query)
         S = recorded_in_blocks(lib, functools.partial(self._S_of_checked, lib, G_of), args)
         return S[()] if isinstance(S, np.ndarray) else S
@@ -153,6 +155,8 @@ class BSSRDF(abc.ABC):
         """
         u_1, u_2 = _split(u)
         lib, (u_1, u_2, mu_o) = broadcast_query(u_1, u_2, mu_o)
+        if asks_nothing(lib, (u_1, u_2, mu_o)):
+            return PositionSample(*(type(u_1)() for _ in PositionSample._fields))
         r = self._per_channel(lib, u_1, lambda sampler, sigma_t: sampler.sample(lib, u_1) / sigma_t)
         phi = 2 * math.pi * u_2
         pdf = self._pdf_own_channel(lib, r)
@@ -172,6 +176,8 @@ class BSSRDF(abc.ABC):
     def pdf_position(self, r: Any, phi: Any, mu_o: Any) -> Any:
         """Density of `sample_position` in 1/mm² at distance r (mm) and azimuth phi; arguments broadcast."""
         lib, (r, phi, mu_o) = broadcast_query(r, phi, mu_o)
+        if asks_nothing(lib, (r, phi, mu_o)):
+            return type(r)()
         return self._per_channel(lib, r, lambda sampler, sigma_t: sigma_t**2 * sampler.pdf(lib, sigma_t * r))
 
     def sample_direction(self, r: Any, mu_o: Any, phi_o: Any, u: Any) -> DirectionSample:
@@ -185,6 +191,8 @@ class BSSRDF(abc.ABC):
         """
         u_1, u_2 = _split(u)
         lib, (u_1, u_2, r, mu_o, phi_o) = broadcast_query(u_1, u_2, r, mu_o, phi_o)
+        if asks_nothing(lib, (u_1, u_2, r, mu_o, phi_o)):
+            return DirectionSample(*(type(u_1)() for _ in DirectionSample._fields))
         cone = min(1.0, self.medium.eta**2)
         mu_i = lib.sqrt(lib.maximum(1 - cone * u_1, 0.0))
         phi_i = 2 * math.pi * u_2 - math.pi
@@ -193,6 +201,8 @@ class BSSRDF(abc.ABC):
     def pdf_direction(self, mu_i: Any, phi_i: Any, r: Any, mu_o: Any, phi_o: Any) -> Any:
         """Density of `sample_direction` over outside directions, 1/sr."""
         lib, (mu_i, phi_i, r, mu_o, phi_o) = broadcast_query(mu_i, phi_i, r, mu_o, phi_o)
+        if asks_nothing(lib, (mu_i, phi_i, r, mu_o, phi_o)):
+            return type(mu_i)()
         cone = min(1.0, self.medium.eta**2)
         inside = (1 - mu_i) * (1 + mu_i) <= cone
         return lib.where(inside, mu_i / (math.pi * cone), 0 * mu_i)

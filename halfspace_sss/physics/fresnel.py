@@ -140,6 +140,9 @@ def boundary_A_jensen(eta: float) -> float:
     eta >= 1: F_dr = -1.440/eta² + 0.710/eta + 0.668 + 0.0636 eta; eta < 1: -0.4399 + 0.7099/eta - 0.3319/eta² +
     0.0636/eta³. At eta = 1 the fit gives 0.0016 instead of 0; exactly matched media use A = 1.
     Source: Jensen et al. 2001; Egan and Hilgeman 1979 for eta < 1.
+
+    Raises:
+        ValueError: the fit passes 1 at that index, so that A and what is made of it would be negative.
     """
     if eta == 1:
         return 1.0
@@ -147,6 +150,10 @@ def boundary_A_jensen(eta: float) -> float:
         F_dr = -1.440 / eta**2 + 0.710 / eta + 0.668 + 0.0636 * eta
     else:
         F_dr = -0.4399 + 0.7099 / eta - 0.3319 / eta**2 + 0.0636 / eta**3
+    if F_dr >= 1:
+        raise ValueError(
+            f"eta must be in [0.26, 3.84] for the published fit of F_dr, which passes 1 there, got {eta:g}"
+        )
     return (1 + F_dr) / (1 - F_dr)
 
 

@@ -8,6 +8,7 @@ import torch
 
 import halfspace_sss
 from halfspace_sss import Medium
+from halfspace_sss.backend import array_types
 
 NAMES = ("r", "mu_i", "phi_i", "mu_o", "phi_o")
 MIDDLE = {"r": 0.7, "mu_i": 0.6, "phi_i": 1.1, "mu_o": 0.8, "phi_o": 2.0}
@@ -49,6 +50,32 @@ def test_derivatives_at_the_bounds_of_all_arguments_are_finite(name):
     for model in models_of(name):
         for kind in (torch.float64, torch.float32):
             assert np.isfinite(by_torch(model, QUERIES, kind)).all(), model.medium
+
+
+def test_dr_jit_has_the_derivatives_of_torch_backwards(name):
+    if name == "neural_paper":
+        pytest.skip("computes in double precision, in which Dr.Jit does not differentiate layers")
+    dr = pytest.importorskip("drjit")
+    kind, model = array_types("llvm").ad.Float, halfspace_sss.bssrdf(name, Medium.from_albedo(0.9, 1.0, 0.3, 1.4))
+    queries = [{**MIDDLE, "r": r, "mu_i": mu} for r, mu in ((0.3, 0.9), (1.0, 0.5), (4.0, 0.2))]
+    args = [kind([q[key] for q in queries]) for key in NAMES]
+    dr.enable_grad(args)
+    dr.backward(model.eval(*args))
+    expected = by_torch(model, queries)
+    found = np.stack([dr.grad(a).numpy() for a in args])
+    np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
+
+
+def test_no_queries_have_no_answers_in_dr_jit(name):
+    """As in NumPy; arrays of one beside an empty one are numbers."""
+    Float, model = array_types("llvm").Float, halfspace_sss.bssrdf(name, Medium.from_albedo(0.9, 1.0, 0.3, 1.4))
+    none = Float([])
+    answers = [
+        model.eval(none, 0.9, 0.1, Float(0.8), 0.5), model.pdf_position(none, none, 0.5),
+        model.pdf_direction(none, 0.1, 0.2, 0.3, 0.4), *model.sample_position(0.5, (none, none)),
+        *model.sample_direction(0.1, 0.2, 0.3, (none, none)),
+    ]  # fmt: skip
+    assert [len(each) for each in answers] == [0] * 9
 
 
 @pytest.mark.parametrize("which", ["mu_i", "mu_o"])

@@ -122,6 +122,17 @@ def test_boundary_constant_has_two_equal_forms(n):
     assert fresnel.boundary_A(n) == pytest.approx((1 + 3 * C_2(n)) / (1 - 2 * C_1(n)), rel=1e-13)
 
 
+@pytest.mark.parametrize("eta", [0.2, 0.25, 3.86, 4.0, 5.0])
+def test_the_published_fit_is_refused_where_it_passes_1_and_dipoles_would_be_negative(eta):
+    with pytest.raises(ValueError, match=rf"eta must be in \[0.26, 3.84\] for the published fit .*, got {eta:g}"):
+        fresnel.boundary_A_jensen(eta)
+
+
+@pytest.mark.parametrize("eta", [0.26, 0.9, 3.84])
+def test_the_published_fit_is_positive_up_to_its_bounds(eta):
+    assert fresnel.boundary_A_jensen(eta) > 0
+
+
 def test_boundary_constants_have_the_stated_values():
     assert fresnel.boundary_A_jensen(1.3) == pytest.approx(2.602, abs=5e-4)
     assert fresnel.boundary_A(1.3) == pytest.approx(2.3405, abs=5e-5)
