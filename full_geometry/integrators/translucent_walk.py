@@ -13,12 +13,13 @@ import mitsuba as mi
 
 from full_geometry.geometry.sensors import camera_rays, sampled_size, splat, widened
 from full_geometry.geometry.shape import SceneMark
-from full_geometry.geometry.snapshot import same_objects
+from full_geometry.geometry.snapshot import Snapshot, same_objects
+from full_geometry.integrators.gathering import light_state
 from full_geometry.integrators.walk_paths import FirstExits, LightVisitor, PathTracer
 from full_geometry.objects.inclusions import check_sensors
 from full_geometry.objects.objects import KnowsUnit, check_size, places_of, translucent_shapes
 from full_geometry.objects.small_emitters import SmallEmitters
-from full_geometry.precomputed.unscattered_light import inside_cells_of, obstacle, unscattered_light
+from full_geometry.precomputed.unscattered_light import UnscatteredLight, inside_cells_of, obstacle, unscattered_light
 from full_geometry.settings import OF_MITSUBA, WALK_LIGHTS, check_parameters
 from full_geometry.surface.textured import shown
 from full_geometry.surface.varying import equivalent
@@ -27,6 +28,7 @@ from full_geometry.walk.emitter_connections import EmitterDirections, InnerLight
 from full_geometry.walk.media import WalkMedia
 from full_geometry.walk.scores import PathScores, with_derivatives
 from full_geometry.walk.straight_light import find_straight_light
+from halfspace_sss.backend import clock
 from halfspace_sss.checks import check_choice
 from halfspace_sss.interrupts import interruptible
 
@@ -81,14 +83,35 @@ def _class(variant: str) -> type:
             self.layers = bool(props.get("layers", False))
             self._prepared: tuple[SceneMark | None, list, list, Any] = (None, [], [], None)
             self._cells: tuple[Any, list] = (None, [])
+            self._kept: tuple[Snapshot | None, UnscatteredLight | None] = (None, None)
+            self.filling = 0.0
 
-        def tracer(self, scene: mi.Scene, seed: int = 0, samples: int = 0, scored: bool = False) -> PathTracer:
+        def prepare(self, scene: mi.Scene, samples: int, seed: int = 0) -> None:
+            """Precompute light once for all calls of `sample`, until objects or emitters change.
+
+            `filling` has the seconds that each image takes for it; media and cells are made once.
+
+            Args:
+                scene: of Mitsuba.
+                samples: of an image, by which the light has its rays.
+                seed: of the light.
+
+            Raises:
+                ValueError: light cannot be precomputed in this scene, and is asked for.
+            """
+            self._kept = light_state(scene), self.tracer(scene, seed, samples).visitor.unscattered
+
+        def tracer(
+            self, scene: mi.Scene, seed: int = 0, samples: int = 0, scored: bool = False,
+            light: UnscatteredLight | None = None,
+        ) -> PathTracer:  # fmt: skip
             """What paths through a scene need; its objects are made ready once, its emitters may have been edited.
 
             Args:
                 seed: of the light that is precomputed.
                 samples: of the image, by which that light has its rays; 0 leaves it to be sampled.
                 scored: whether derivatives are asked for, which leave light to be sampled.
+                light: that is known already.
             """
             self._prepared = _prepared(scene, self._prepared, self.mm_per_unit)
             media, small = self._prepared[-1], SmallEmitters.of(scene)
@@ -96,8 +119,10 @@ def _class(variant: str) -> type:
             if samples and self.precomputes(scene, media):
                 if self._cells[0] is not media:
                     self._cells = media, inside_cells_of(media)
-                rays = min(max(samples // SAMPLES_PER_RAY, FEWEST_RAYS), MOST_RAYS)
-                light = unscattered_light(scene, media, seed, self._cells[1], rays)
+                if light is None:
+                    started, rays = clock(), min(max(samples // SAMPLES_PER_RAY, FEWEST_RAYS), MOST_RAYS)
+                    light = unscattered_light(scene, media, seed, self._cells[1], rays)
+                    self.filling = clock() - started
                 visitor = LightVisitor(scene, media, small, None, None, None, inner, self.blur, light)
                 return PathTracer(visitor, self.max_depth, self.rr_depth, self.hidden, self.layers)
             connections = find_connections(scene, media, small, self.connection_share, scored)
@@ -147,7 +172,9 @@ def _class(variant: str) -> type:
         ) -> tuple:
             with dr.suspend_grad():
                 seed = tuple(int(2**24 * sampler.next_1d()[0]) for _ in range(2))
-                tracer = self.tracer(scene, seed[0], sampler.wavefront_size())
+                known, light = self._kept
+                light = light if light is not None and known == light_state(scene) else None
+                tracer = self.tracer(scene, seed[0], sampler.wavefront_size(), light=light)
                 rays = tracer.shown(widened(ray, sampler.wavefront_size()))
                 L, seen, emission = tracer.trace(rays, _on_device(LANES), seed)
             layer = list(mi.Color3f(emission)) if self.layers else []

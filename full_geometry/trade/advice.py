@@ -20,7 +20,7 @@ from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.trade.assessing import assess
 from full_geometry.trade.job import Job
 from full_geometry.trade.results import UNNAMED, Assessment, ObjectTrade, TechniqueTrade, html_table, samples_for
-from full_geometry.trade.techniques import GATHERED, LAMBERT, Technique
+from full_geometry.trade.techniques import GATHERED, LAMBERT, PRECOMPUTED_WALKS, Technique
 from halfspace_sss.noise_free import short
 from halfspace_sss.physics.medium import Medium
 
@@ -60,7 +60,8 @@ class Advice:
 
     Attributes:
         objects: for each object alone.
-        integrator: "path_traced", "bssrdf" or "bssrdf, gathered", which serves all objects at once in the least time.
+        integrator: "path_traced", "path_traced, precomputed", "bssrdf" or "bssrdf, gathered", which serves all objects
+            at once in the least time.
         seconds: that it takes.
         assessment: what this rests on.
         tolerance: that was asked.
@@ -138,7 +139,7 @@ def advise(assessment: Assessment, job: Job) -> Advice:
     """The ways for a job, from what has been measured."""
     objects = tuple(_object(o, job) for o in assessment.objects)
     told = [o for o in objects if o.way is not None]
-    kinds = (INTEGRATOR, f"{INTEGRATOR}, {GATHERED}", PATH_TRACED)
+    kinds = (INTEGRATOR, f"{INTEGRATOR}, {GATHERED}", PATH_TRACED, PRECOMPUTED_WALKS.name)
     times = {kind: sum(_best(o, kind) for o in told) for kind in kinds}
     integrator = min(times, key=lambda kind: times[kind])
     return Advice(objects, integrator, times[integrator], assessment, job.tolerance)
@@ -146,12 +147,13 @@ def advise(assessment: Assessment, job: Job) -> Advice:
 
 def _best(advice: ObjectAdvice, kind: str) -> float:
     """Least seconds of an object by an integrator; what does not spread is the same in both kinds of light."""
-    served = {
-        way: (way == PATH_TRACED) == (kind == PATH_TRACED)
-        and (way == LAMBERT or way.endswith(GATHERED) == kind.endswith(GATHERED))
-        for way in (o.way for o in advice.options)
-    }
-    return min((o.seconds for o in advice.options if served[o.way]), default=math.inf)
+
+    def served(technique: Technique) -> bool:
+        if technique.walks or kind.startswith(PATH_TRACED):
+            return technique.name == kind
+        return technique.model == LAMBERT or (technique.light == GATHERED) == kind.endswith(GATHERED)
+
+    return min((o.seconds for o in advice.options if o.way and served(Technique.of(o.way))), default=math.inf)
 
 
 def _object(assessed: ObjectTrade, job: Job) -> ObjectAdvice:

@@ -19,7 +19,15 @@ from full_geometry.trade.job import TRACED_SHARE, Effort, Job
 from full_geometry.trade.measuring import OWN_SHARE, RunBudget, SceneSamples
 from full_geometry.trade.results import Assessment, TechniqueTrade
 from full_geometry.trade.statistics import seeded
-from full_geometry.trade.techniques import GATHERED, WALKS, Stage, Technique, stage, techniques
+from full_geometry.trade.techniques import (
+    GATHERED,
+    PRECOMPUTED_WALKS,
+    WALKS,
+    Stage,
+    Technique,
+    stage,
+    techniques,
+)
 from full_geometry.transport.models import lookup
 from halfspace_sss.checks import check_interval
 from halfspace_sss.progress import NamedProgress
@@ -31,7 +39,7 @@ LEAST_SHARE = 0.25  # of the time, for walks and what may win against them, howe
 LAST_SHARE = 0.1  # likewise, after light has been gathered
 KNOWN = 0.1  # standard error of a bias² over the squared tolerance that is enough
 CANDIDATES = (
-    PATH_TRACED, "lambert", "better_dipole", "neural", "full_geometry", "neural_shape",
+    PATH_TRACED, PRECOMPUTED_WALKS.name, "lambert", "better_dipole", "neural", "full_geometry", "neural_shape",
     *(f"{name}, {GATHERED}" for name in ("better_dipole", "neural", "full_geometry", "neural_shape")),
 )  # fmt: skip
 DEAR = ("neural_shape",)  # to run, which takes DEAR_SECONDS
@@ -94,7 +102,7 @@ def _chosen(models: Sequence[str] | None) -> list[Technique]:
     if models is None:
         return techniques()
     chosen = [Technique.of(name) for name in models]
-    return [WALKS, *(technique for technique in dict.fromkeys(chosen) if not technique.walks)]
+    return [WALKS, *(technique for technique in dict.fromkeys(chosen) if not technique.exact)]
 
 
 def assess_stage(
@@ -148,8 +156,10 @@ def _assessed_for(
         out |= too_dear(samples, first, chosen, job) if job.count_training else {}
         ahead, later = ([t for t in some if t not in out] for some in (ahead, later))
         samples.keep(first)
-        # Run one model of the half-space; where it is far off the others are left out, as they err alike.
+        # Run walks with precomputed light, and one model of the half-space; where it is far off the others are left
+        # out, as they err alike.
         flat = [t for t in ahead if not t.walks and lookup(t.model).capabilities.of_half_space]
+        run([t for t in ahead if t.walks and not t.exact], 48)
         run(flat[:1], 45)
         out |= as_far_off(samples.assessment(), flat, later, job.tolerance)
         ahead, later = ([t for t in some if t not in out] for some in (ahead, later))
@@ -208,7 +218,7 @@ def _go_on(
         rows = {technique: o.way(technique.name) for technique in few} if o.ways else {}
         for technique, row in rows.items():
             if not row.refusal and row.variance > 0:
-                others = max(len(few) - 1, 1) if technique.walks else 1
+                others = max(len(few) - 1, 1) if technique.exact else 1
                 parts[technique] = max(parts[technique], math.sqrt(others * samples.noise(k, technique).value))
                 enough[technique] = max(enough[technique], samples.enough(k, technique, row, known))
     whole = max(sum(parts.values()), 1e-30)

@@ -67,7 +67,7 @@ def promising(
         best = most_promising(seen, wanted, job)
         why |= dict.fromkeys(wanted, f"not measured, as {best.name} promises more: ask for it by its name")
         names -= {technique.model for technique in wanted}  # they cannot win where their light is worth gathering
-    return [technique for technique in ahead if technique.name in names or technique.walks], best, why
+    return [technique for technique in ahead if technique.name in names or technique.exact], best, why
 
 
 def gathering_seconds(row: TechniqueTrade) -> float:

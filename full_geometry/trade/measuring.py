@@ -11,6 +11,7 @@ from typing import NamedTuple
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.integrators.translucent_walk import SAMPLES_PER_RAY
 from full_geometry.learning.learners import learners
 from full_geometry.scenes.scene_files import first_cause
 from full_geometry.surface.wrapped import surface_of
@@ -25,11 +26,12 @@ from full_geometry.trade.statistics import (
     mean_square,
     mean_square_of,
     mean_square_of_parts,
+    noise_of_parts,
     ratio_of_means,
     relative_variance,
     seeded,
 )
-from full_geometry.trade.techniques import GATHERED, WALKS, Stage, Technique
+from full_geometry.trade.techniques import GATHERED, PRECOMPUTED, RAYS, WALKS, Stage, Technique
 from halfspace_sss.backend import clock
 from halfspace_sss.progress import NamedProgress
 
@@ -93,8 +95,8 @@ class SceneSamples:
         """No samples yet, at exits of all objects, with kernels ready for what techniques have in common."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # they are heard when the techniques are made ready again
-            for walks in (True, False):
-                warm_up(on, [each for each in chosen if each.walks == walks and each.light != GATHERED])
+            for kind in ((True, "sampled"), (True, PRECOMPUTED), (False, "sampled")):
+                warm_up(on, [each for each in chosen if (each.walks, each.light) == kind])
         started = clock()
         seen = visible_exits(on.scene, on.shapes, effort.sensor, effort.exits, seeded(effort.seed, 41))
         mfp = [_mfp(on, k) for k in range(len(seen))]
@@ -126,7 +128,7 @@ class SceneSamples:
             tell(technique.name, done)
             if isinstance(sampled[technique], str):
                 continue
-            share = budget.traced if technique.walks and len(chosen) > 1 else 1 / (len(chosen) - done)
+            share = budget.traced if technique.exact and len(chosen) > 1 else 1 / (len(chosen) - done)
             if technique.light == GATHERED and len(chosen) > 1 and not samples:
                 share = min(share, GATHERED_SHARE)
             for half, part in enumerate(on.runs(technique)):
@@ -139,7 +141,7 @@ class SceneSamples:
                     result, beside = _begun(on, part, points, (number, each), k, sampled[technique], half)
                     end, started = end + beside, started + beside
                     left = share * _part_of(on, technique, part, budget) * (end - started) - (clock() - started)
-                    blurs = technique.walks and on.blurs and not part.smoothed
+                    blurs = technique.exact and on.blurs and not part.smoothed
                     left *= WALKED if blurs else 1.0
                     # Go on for its share of what is left.
                     sample_more(on, part, points, result, number, seconds=left, samples=samples)
@@ -148,7 +150,7 @@ class SceneSamples:
                         wanted = result.estimate.samples // 2 - sum(each.samples for each in known)
                         result.blur = joined([*known, sample_blur(on, points, number, wanted)])
                 except (ValueError, RuntimeError) as error:
-                    if technique.walks:
+                    if technique.exact:
                         raise ValueError(first_cause(error)) from error
                     sampled[technique] = first_cause(error)
                     break
@@ -280,7 +282,7 @@ def _row(on: Stage, k: int, technique: Technique, sampled: list[Sampled] | str, 
     last = _of_cost(on, technique, sampled)[-1]  # with kernels ready
     # Estimate bias² against walks; of gathered light by two parts, whose noise more samples do not take away.
     bias2, doubt = Number(0.0, 0.0), Number(0.0, 0.0)
-    if not technique.walks:
+    if not technique.exact:
         several = len(parts) > 1
         bias2 = mean_square_of_parts(parts, b, _kept(on, k, technique)) if several else mean_square(bias, b)
     if walked.blur:
@@ -288,8 +290,12 @@ def _row(on: Stage, k: int, technique: Technique, sampled: list[Sampled] | str, 
     # Add what the blur of delta lights and the smoothing of the environment may be off by to its standard error.
     effect = SMOOTHING_EFFECT * max(bias2.value, 0.0) if on.smoothed else 0.0
     bias2 = Number(bias2.value + max(doubt.value, 0.0), math.hypot(bias2.error, doubt.error, effect))
-    ratios = [(1.0, 0.0) if technique.walks else ratio_of_means(bias, b, c) for c in range(len(b.mean))]
+    ratios = [(1.0, 0.0) if technique.exact else ratio_of_means(bias, b, c) for c in range(len(b.mean))]
     variance = relative_variance(cost, walked.estimate)
+    if technique.light == PRECOMPUTED:
+        # Rays of light are as many as samples: their noise falls with that of walks.
+        noise, samples = noise_of_parts(parts, b), _samples_of_pixel(on)
+        variance = Number(variance.value + samples * noise.value, math.hypot(variance.error, samples * noise.error))
     return TechniqueTrade(
         way=technique.name, bias2=bias2.value, bias2_error=bias2.error, ratio=tuple(r[0] for r in ratios),
         ratio_error=tuple(r[1] for r in ratios), variance=variance.value, variance_error=variance.error,
@@ -298,8 +304,15 @@ def _row(on: Stage, k: int, technique: Technique, sampled: list[Sampled] | str, 
     )  # fmt: skip
 
 
+def _samples_of_pixel(on: Stage) -> float:
+    """Of an image whose walks have as many rays of light as those that are measured."""
+    return RAYS * SAMPLES_PER_RAY / math.prod(int(n) for n in on.scene.sensors()[0].film().crop_size())
+
+
 def _kept(on: Stage, k: int, technique: Technique) -> float:
-    """The share of the variance of parts of gathered light that a render has."""
+    """Of the variance of parts of light, the share that more samples leave in a render."""
+    if technique.walks:
+        return 0.0
     one, two = (on.integrator(half).gathering for half in technique.halves)
     return one.kept(two, k)
 

@@ -14,11 +14,12 @@ import numpy as np
 
 from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.integrators.gathering import PART
+from full_geometry.integrators.translucent_walk import SAMPLES_PER_RAY
 from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.settings import variant_channels
 from full_geometry.trade.exits import Exits
 from full_geometry.trade.statistics import RadianceEstimate, seeded
-from full_geometry.trade.techniques import Stage, Technique
+from full_geometry.trade.techniques import GATHERED, PRECOMPUTED, RAYS, Stage, Technique
 from halfspace_sss.backend import clock
 
 LANES = 2**18  # of a launch
@@ -74,7 +75,7 @@ def first_sample(
     started = clock()
     _prepare(stage, technique)
     preparation = preparing = clock() - started
-    if technique.part:  # of all samples, after what is made ready for parts and whole alike
+    if technique.light == GATHERED and technique.part:  # of all samples, after what parts and whole have in common
         made, light = stage.integrator(technique).gathering.seconds
         preparation = max(preparing - made - light, 0.0) + made / PART + 2 * light
         same = stage.paces.get((object, replace(technique, light="sampled", part=0)))  # which made the objects for both
@@ -115,8 +116,11 @@ def warm_up(stage: Stage, techniques: Sequence[Technique]) -> None:
 
 
 def _prepare(stage: Stage, technique: Technique) -> None:
-    integrator = stage.integrator(technique)
-    (integrator.prepare if is_bssrdf(integrator) else integrator.tracer)(stage.lit(technique))
+    integrator, scene = stage.integrator(technique), stage.lit(technique)
+    if technique.light == PRECOMPUTED:
+        integrator.prepare(scene, RAYS * SAMPLES_PER_RAY, technique.part)
+    else:
+        (integrator.prepare if is_bssrdf(integrator) else integrator.tracer)(scene)
 
 
 def sample_more(

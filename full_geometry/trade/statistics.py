@@ -161,6 +161,14 @@ def mean_square_of_parts(parts: tuple[RadianceEstimate, RadianceEstimate], b: Ra
     return _with_shared(_ratio((left + kept * noise).mean(axis=0), walks.mean.mean(axis=0), 2), walks)
 
 
+def noise_of_parts(parts: tuple[RadianceEstimate, RadianceEstimate], b: RadianceEstimate) -> Number:
+    """Variance of what two parts are made of beside their samples, over the square of the mean radiance of b."""
+    one, two = (part.steady for part in parts)
+    square = 0.5 * ((one.mean - two.mean) ** 2 - one.noise - two.noise)
+    found = _with_shared(_ratio(square.mean(axis=0), b.mean.mean(axis=0), 2), one, two)
+    return Number(max(found.value, 0.0), found.error)
+
+
 def joined(parts: Sequence[RadianceEstimate]) -> RadianceEstimate:
     """All samples of several estimates at the same exits."""
     result = RadianceEstimate(*parts[0].first.shape)

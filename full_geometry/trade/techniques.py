@@ -24,7 +24,8 @@ from halfspace_sss.registry import model_class, models
 
 LAMBERT = "lambert"
 NO_SINGLE = "without single scattering"
-GATHERED = "gathered"
+GATHERED, PRECOMPUTED = "gathered", "precomputed"
+RAYS = 2**19  # of light precomputed for walks, for each object: its noise at a point is 3 to 8 %
 
 
 @dataclass(frozen=True)
@@ -34,8 +35,8 @@ class Technique:
     Args:
         model: name of a model, or "path_traced": walks.
         orders: "multiple" leaves single scattering out; None takes the orders of the scene.
-        light: "sampled" or "gathered", see `Settings`.
-        part: of gathered light, see `Gathering`; 0 for all of it.
+        light: "sampled"; of models "gathered", see `Settings`; of walks "precomputed", see `unscattered_light`.
+        part: of gathered light, see `Gathering`, 0 for all of it; of precomputed light one independent of other parts.
         blur: of walks, see `translucent_walk`.
         smoothed: whether by the smoothed environment, see `smoothed_environment`.
     """
@@ -53,43 +54,49 @@ class Technique:
         return self.model == PATH_TRACED
 
     @property
+    def exact(self) -> bool:
+        """Whether it is walks with sampled light, by which biases are told."""
+        return self.walks and self.light == "sampled"
+
+    @property
     def halves(self) -> tuple[Technique, ...]:
-        """The techniques that it is measured by: itself, or two independent parts of gathered light."""
-        return (replace(self, part=1), replace(self, part=2)) if self.light == GATHERED else (self,)
+        """The techniques that it is measured by: itself, or two independent parts of gathered or precomputed light."""
+        return (self,) if self.light == "sampled" else (replace(self, part=1), replace(self, part=2))
 
     @property
     def name(self) -> str:
         """The name in tables."""
-        parts = (self.model, NO_SINGLE if self.orders else "", GATHERED if self.light == GATHERED else "")
+        parts = (self.model, NO_SINGLE if self.orders else "", "" if self.light == "sampled" else self.light)
         return ", ".join(filter(None, parts))
 
     @property
     def flags(self) -> str:
         """The options of the command `render` for it."""
         asked = f"--model {self.model}" + (f" --orders {self.orders}" if self.orders else "")
-        return asked + (f" --light {GATHERED}" if self.light == GATHERED else "")
+        return asked + (f" --light {self.light}" if self.walks or self.light != "sampled" else "")
 
     @classmethod
     def of(cls, name: str) -> Technique:
         """The technique of that name; ValueError if there is none."""
         model, *more = name.split(", ")
         check_choice("way", model, (PATH_TRACED, *(m for m in model_names() if m != AUTO)))
-        if model == PATH_TRACED and more:
-            raise ValueError(f"the way {PATH_TRACED!r} must stand alone, got {name!r}")
+        of_model = (NO_SINGLE,) if model == LAMBERT else (NO_SINGLE, GATHERED)
         for part in more:
-            known = (NO_SINGLE,) if model == LAMBERT else (NO_SINGLE, GATHERED)
-            check_choice(f"what follows {model}", part, known)
-        return cls(model, "multiple" if NO_SINGLE in more else None, GATHERED if GATHERED in more else "sampled")
+            check_choice(f"what follows {model}", part, (PRECOMPUTED,) if model == PATH_TRACED else of_model)
+        light = next((part for part in more if part != NO_SINGLE), "sampled")
+        return cls(model, "multiple" if NO_SINGLE in more else None, light)
 
 
 WALKS = Technique(PATH_TRACED)
+PRECOMPUTED_WALKS = Technique(PATH_TRACED, light=PRECOMPUTED)
 
 
 def techniques() -> list[Technique]:
-    """All of them: path traced first, a diffuse surface, every model with light sampled and gathered, and those without
-    the single scattering."""
+    """All of them: path traced first, with light sampled and precomputed, a diffuse surface, every model with light
+    sampled and gathered, and those without the single scattering."""
     names = [name for name in model_names() if name not in (AUTO, LAMBERT)]
-    results = [WALKS, Technique(LAMBERT), *map(Technique, names), *(Technique(name, light=GATHERED) for name in names)]
+    results = [WALKS, PRECOMPUTED_WALKS, Technique(LAMBERT), *map(Technique, names)]
+    results += [Technique(name, light=GATHERED) for name in names]
     bare = [name for name in models() if model_class(name).orders == "multiple"]
     return results + [Technique(name, "multiple") for name in bare if name in ("better_dipole", "neural")]
 
@@ -154,16 +161,16 @@ class Stage:
 
     def integrator(self, technique: Technique) -> mi.Integrator:
         """The integrator of a technique, which keeps what it has made ready; shapes are the same in all light."""
-        technique = replace(technique, smoothed=False)
+        technique = replace(technique, smoothed=technique.smoothed and technique.light == PRECOMPUTED)
         if technique not in self._integrators:
             if technique.walks:
-                plugin = {"type": "translucent_walk", **self.settings, "blur": technique.blur, "light": "sampled"}
+                plugin = {"type": "translucent_walk", **self.settings, "blur": technique.blur, "light": technique.light}
             else:
                 plugin = {"type": "bssrdf", **self.settings, **self.bssrdf}
                 plugin |= {"model": technique.model, "light": technique.light}
                 plugin |= {"orders": technique.orders} if technique.orders else {}
             self._integrators[technique] = mi.load_dict(plugin)
-            if technique.part:
+            if technique.part and not technique.walks:
                 self._integrators[technique].gathering = Gathering(technique.part)
             sampled = self._integrators.get(replace(technique, light="sampled", part=0))
             # spectral variants refuse gathered light

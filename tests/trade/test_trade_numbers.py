@@ -21,6 +21,7 @@ from full_geometry.trade.statistics import (
     RadianceEstimate,
     mean_square,
     mean_square_of_parts,
+    noise_of_parts,
     relative_variance,
 )
 from full_geometry.trade.techniques import Technique
@@ -223,21 +224,48 @@ def test_auto_takes_gathered_light_only_where_it_is_asked_for_and_counts_its_pre
     assert picked(found, 0.1, "gathered").sentence.startswith("object 'ball': neural, gathered, < 1.6 % off")
 
 
-@pytest.mark.parametrize("way", ["path_traced", "neural", "neural, gathered", "neural, without single scattering"])
+@pytest.mark.parametrize(
+    "way",
+    ["path_traced", "path_traced, precomputed", "neural", "neural, gathered", "neural, without single scattering"],
+)
 def test_a_way_comes_back_by_its_name(way: str) -> None:
     assert Technique.of(way).name == way
 
 
-@pytest.mark.parametrize("unknown", ["lambert, gathered", "neural, collected"])
+@pytest.mark.parametrize(
+    "unknown", ["lambert, gathered", "neural, collected", "neural, precomputed", "path_traced, gathered",
+                "path_traced, without single scattering"]
+)  # fmt: skip
 def test_a_way_that_does_not_exist_is_refused(unknown: str) -> None:
     with pytest.raises(ValueError, match="what follows"):
         Technique.of(unknown)
 
 
-@pytest.mark.parametrize("more", ["gathered", "without single scattering"])
-def test_path_traced_is_a_way_of_its_own(more: str) -> None:
-    with pytest.raises(ValueError, match=f"the way 'path_traced' must stand alone, got 'path_traced, {more}'"):
-        Technique.of(f"path_traced, {more}")
+@pytest.mark.parametrize(
+    ("way", "flags"),
+    [("path_traced", "--model path_traced --light sampled"), ("neural, gathered", "--model neural --light gathered"),
+     ("path_traced, precomputed", "--model path_traced --light precomputed"), ("lambert", "--model lambert")],
+)  # fmt: skip
+def test_the_flags_of_a_way_ask_for_that_way(way: str, flags: str) -> None:
+    assert Technique.of(way).flags == flags
+
+
+def test_precomputed_walks_serve_all_objects_where_they_are_the_cheapest() -> None:
+    walks = _way("path_traced, precomputed", 0.003, 0.001, 1e-7, preparation=0.5)
+    found = recommend(_assessment(GOOD, walks), tolerance=0.02, images=1000)
+    assert found.integrator == found.objects[0].way == "path_traced, precomputed"
+    assert "--model path_traced --light precomputed" in str(found)
+
+
+def test_the_noise_of_precomputed_light_is_told_by_two_parts_and_is_no_bias() -> None:
+    rng, off = np.random.default_rng(3), 0.05
+    L = 1 + rng.random((1, 2000))
+    one, two, walks = (_estimate(rng, L * (1 + k * rng.standard_normal(L.shape)), 0.1) for k in (off, off, 0))
+    noise = noise_of_parts((one, two), walks)
+    assert noise.error < 0.1 * noise.value
+    assert noise.value == pytest.approx(off**2 * np.mean(L**2) / np.mean(L) ** 2, abs=4 * noise.error)
+    bias2 = mean_square_of_parts((one, two), walks, 0.0)
+    assert abs(bias2.value) < 4 * bias2.error < 0.2 * noise.value
 
 
 def test_a_record_comes_back_as_it_was() -> None:
