@@ -114,14 +114,13 @@ def render(
     from full_geometry.integrators.bssrdf import is_bssrdf
     from full_geometry.scenes.picture import Picture
     from full_geometry.scenes.reference import chosen
-    from full_geometry.scenes.scene_files import open_scene
     from halfspace_sss.locks import one_writer
     from halfspace_sss.provenance import check_folder
 
     limits, parameters = until.limits(), shared.defined(define)
     drawers = _drawers(context, images.denoise)
     check_folder(out)
-    loaded = open_scene(scene, transport.model, transport.orders, parameters, transport.settings(images.denoise))
+    loaded = _opened(scene, transport, parameters, images.denoise)
     sensors = _sensors(images.sensor, loaded)
     shared.say(*chosen(loaded, loaded.integrator()).get("choices", {}).values())
     if images.denoise and any(not loaded.sensors()[k].film().rfilter().is_box_filter() for k in sensors):
@@ -158,6 +157,27 @@ def _off(scene: Any, image: np.ndarray, sensor: int, model: str | None) -> list[
         return told(mean_ratios(scene, image, sensor), model or "the model of the scene")
     except (ValueError, RuntimeError) as error:
         return [f"how far models are off is not known, as random walks refuse the scene: {first_cause(error)}"]
+
+
+def _opened(scene: Path, transport: TransportOptions, parameters: dict[str, str], denoise: bool) -> Any:
+    """The scene; where all models are "auto" by walks, if these are the cheapest that keep the tolerance."""
+    import mitsuba as mi
+
+    from full_geometry.capabilities import AUTO, PATH_TRACED
+    from full_geometry.integrators.bssrdf import is_bssrdf
+    from full_geometry.scenes.scene_files import open_scene
+    from full_geometry.trade.automatic import models_of, walks_instead
+
+    settings = transport.settings(denoise)
+    loaded = open_scene(scene, transport.model, transport.orders, parameters, settings)
+    integrator = loaded.integrator()
+    if mi.is_spectral or not is_bssrdf(integrator) or set(models_of(loaded, integrator.settings)) != {AUTO}:
+        return loaded
+    light, why = walks_instead(loaded, integrator.settings)
+    if not light:
+        return loaded
+    shared.say(why)
+    return open_scene(scene, PATH_TRACED, transport.orders, parameters, {**settings, "light": light})
 
 
 def _sensors(text: str, scene: Any) -> list[int]:

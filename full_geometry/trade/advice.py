@@ -194,11 +194,13 @@ def _option(assessed: ObjectTrade, row: TechniqueTrade, job: Job) -> _Raw:
 
 
 def _in_time(assessed: ObjectTrade, row: TechniqueTrade, job: Job) -> _Raw:
-    """Samples and error of a technique in the time that is allowed."""
-    left = (job.seconds or math.inf) - _once(row, job)
+    """Samples and error of a technique in the time that is allowed; its bias where there is no limit."""
+    if job.seconds is None:
+        return math.inf, 0, row.bias, row
+    left = job.seconds - _once(row, job)
     spp = math.floor(left / (job.images * assessed.pixels * row.seconds)) if left > 0 else 0
     error = math.hypot(row.bias, math.sqrt(row.variance / spp)) if spp > 0 else math.inf
-    return float(job.seconds or math.inf), spp, error, row
+    return float(job.seconds), spp, error, row
 
 
 def _told(assessed: ObjectTrade, option: _Raw, best: _Raw, job: Job) -> Option:
@@ -224,8 +226,11 @@ def _told(assessed: ObjectTrade, option: _Raw, best: _Raw, job: Job) -> Option:
 
 def _nearest(option: _Raw, best: _Raw, job: Job) -> Option:
     took, spp, error, row = option
+    within = f" in {_time(took)}" if took < math.inf else ""
     if option is best:
-        why = f"no way keeps {job.tolerance:.3g} in {_time(took)}; {row.way} comes nearest, {100 * error:.3g} %"
+        why = f"no way keeps {job.tolerance:.3g}{within}; {row.way} comes nearest, {100 * error:.3g} %"
+    elif not within:
+        why = f"{row.way} is {_off(row)}"
     elif spp > 0:
         why = f"{row.way} comes to {100 * error:.3g} % in {_time(took)}"
     else:

@@ -156,14 +156,12 @@ def _assessed_for(
         out |= too_dear(samples, first, chosen, job) if job.count_training else {}
         ahead, later = ([t for t in some if t not in out] for some in (ahead, later))
         samples.keep(first)
-        # Run walks with precomputed light, and one model of the half-space; where it is far off the others are left
-        # out, as they err alike.
+        # Run one model of the half-space; where it is far off the others are left out, as they err alike.
         flat = [t for t in ahead if not t.walks and lookup(t.model).capabilities.of_half_space]
-        run([t for t in ahead if t.walks and not t.exact], 48)
         run(flat[:1], 45)
         out |= as_far_off(samples.assessment(), flat, later, job.tolerance)
         ahead, later = ([t for t in some if t not in out] for some in (ahead, later))
-        run([t for t in ahead if not t.walks and t not in flat[:1]], 43)
+        run([t for t in ahead if not t.exact and t not in flat[:1]], 43)
     first = samples.assessment()
     seen = [k for k, o in enumerate(first.objects) if o.ways and not o.is_dark]
     if not seen:

@@ -1,10 +1,11 @@
 """The model "auto": the cheapest one of each object whose bias keeps the tolerance of the integrator, by measurement.
 
 All models that are installed are candidates, with light as the integrator states it: "sampled" by default, "gathered",
-or "auto" for the cheaper of both. Costs are seconds of an image, preparation counted. If no model keeps the tolerance
-the least biased is taken, with sampled light. The choice is kept in a file, so that the same scene gets the same again;
-the file can be deleted, and a model that is named in the scene needs no choice. The integrator cannot mix walks with
-models, and says where walks would be the better way.
+or "auto" for the cheaper of both. Costs are seconds of an image, preparation counted. Where the few samples of a choice
+do not tell whether a model keeps the tolerance, the least biased is taken; where none does, `bssrdf` refuses the scene.
+The command `render` takes walks, with precomputed or sampled light, where they are the cheapest way that `recommend`
+finds. Inside `bssrdf`, which cannot walk, a sentence says so. Choices are kept in files, so that the same scene gets
+the same again; they can be deleted, and a model that is named in the scene needs no choice.
 """
 
 from __future__ import annotations
@@ -17,15 +18,23 @@ from typing import Any, NamedTuple
 
 import mitsuba as mi
 
-from full_geometry.capabilities import AUTO, Choices
+from full_geometry.capabilities import AUTO, PATH_TRACED, Choices
 from full_geometry.geometry.identity import scene_hash
 from full_geometry.objects.objects import refuse_instances, translucent_shapes
 from full_geometry.settings import Settings
 from full_geometry.surface.wrapped import surface_of
-from full_geometry.trade.assessing import assess_stage
-from full_geometry.trade.job import Effort
+from full_geometry.trade.advice import Advice, advise
+from full_geometry.trade.assessing import CANDIDATES, assess_for, assess_stage
+from full_geometry.trade.contending import DOUBT
+from full_geometry.trade.job import Effort, Job
 from full_geometry.trade.results import ObjectTrade, TechniqueTrade
-from full_geometry.trade.techniques import GATHERED, LAMBERT, WALKS, Stage, Technique
+from full_geometry.trade.techniques import (
+    GATHERED,
+    LAMBERT,
+    WALKS,
+    Stage,
+    Technique,
+)
 from full_geometry.transport.models import model_names
 from halfspace_sss.neural.store import weights_folder
 from halfspace_sss.provenance import provenance, write_atomically
@@ -34,7 +43,7 @@ ENVIRONMENT_VARIABLE = "HALFSPACE_SSS_CHOICES"
 DEFAULT = "neural"
 EXITS = 96  # of each object
 SAMPLES = (64, 2048)  # fewest and most of each exit by each way; the fewest take some tenths of a second
-FORMAT = "halfspace-sss choice 2"
+FORMAT = "halfspace-sss choice 3"
 
 
 def choices_folder() -> Path:
@@ -52,12 +61,13 @@ def choose(scene: mi.Scene, settings: Settings) -> Choices:
             takes, as far as `SAMPLES` allows.
 
     Raises:
-        ValueError: the scene cannot be rendered, or the file of an earlier choice is damaged.
+        ValueError: the scene cannot be rendered, models are known not to keep the tolerance, or the file of an earlier
+            choice is damaged.
     """
     shapes = translucent_shapes(scene)
     refuse_instances(scene, shapes, "the model 'auto'")
     on = Stage(scene, shapes, settings.shared(), settings.of_models())
-    named = [settings.model or surface_of(shape).spec.model for shape in on.shapes]
+    named = models_of(scene, settings)
     path = choices_folder() / f"{_identity(on, settings)}.json"
     record = _read(path) if path.is_file() else None
     if record is None or len(record["models"]) != len(named):
@@ -66,7 +76,14 @@ def choose(scene: mi.Scene, settings: Settings) -> Choices:
     for sentence in record["sentences"]:
         mi.Log(mi.LogLevel.Info, sentence)
     models = {k: model for k, model in enumerate(record["models"]) if named[k] == AUTO}
+    if record["refusal"]:
+        raise ValueError(record["refusal"])
     return Choices(models, record["light"], dict(zip(on.names, record["sentences"])))
+
+
+def models_of(scene: mi.Scene, settings: Settings) -> list[str]:
+    """What the integrator or the surfaces of a scene name as the model of each translucent object."""
+    return [settings.model or surface_of(shape).spec.model for shape in translucent_shapes(scene)]
 
 
 def _identity(on: Stage, settings: Settings) -> str:
@@ -81,6 +98,7 @@ def _read(path: Path) -> dict[str, Any]:
         models, sentences = ([str(name) for name in record[key]] for key in ("models", "sentences"))
         known = record["format"] == FORMAT and all(name in model_names() and name != AUTO for name in models)
         known &= record["light"] in ("sampled", GATHERED) and len(models) == len(sentences)
+        known &= isinstance(record["refusal"], str)
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} must be the record of a choice, got {error!r}; delete it to choose anew") from error
     if not known:
@@ -101,6 +119,9 @@ def _measured(on: Stage, named: list[str], settings: Settings) -> dict[str, Any]
     about = provenance(tolerance=settings.tolerance, samples=samples, exits=EXITS)
     record = {"format": FORMAT, "light": light, "models": [pick.model for pick in picks[light]]}
     record |= {"sentences": [pick.sentence for pick in picks[light]]}
+    off = [pick.sentence for pick, name in zip(picks[light], named) if name == AUTO and pick.is_wrong]
+    refusal = f"a model must keep the tolerance {settings.tolerance:g}, or be named: {'; '.join(off)}" if off else ""
+    record["refusal"] = refusal
     return {**record, "assessment": result.record(), "provenance": about}
 
 
@@ -128,11 +149,19 @@ def _samples(on: Stage, share: float) -> int:
 
 
 class Pick(NamedTuple):
-    """A model for an object, seconds of an image by it (infinite if it keeps no tolerance), and one sentence."""
+    """A model for an object.
+
+    Args:
+        model: its name.
+        seconds: of an image by it; infinite if it is not known to keep the tolerance.
+        sentence: why.
+        is_wrong: whether it is known not to keep the tolerance.
+    """
 
     model: str
     seconds: float
     sentence: str
+    is_wrong: bool = False
 
 
 def _total(picks: list[Pick]) -> float:
@@ -160,7 +189,56 @@ def picked(assessed: ObjectTrade, tolerance: float, light: str = "sampled", mode
     if not keeping or walks < cost:
         why += "; translucent_walk would be better"
         why += " and faster" if walks < cost else ", which has no bias"
-    return Pick(techniques[best.way], cost if keeping else math.inf, f"object {assessed.object!r}: {best.way}, {why}")
+    seconds, why = cost if keeping else math.inf, f"object {assessed.object!r}: {best.way}, {why}"
+    return Pick(techniques[best.way], seconds, why, not _may_keep(best, tolerance))
+
+
+def walks_instead(scene: mi.Scene, settings: Settings) -> tuple[str, str]:
+    """The light of walks that are cheaper than models for all objects, and why; "" and "" where models are.
+
+    It is decided as `recommend` does, for one image, and kept in a file beside the choices of models.
+
+    Args:
+        scene: the Mitsuba scene, all of whose objects have the model "auto".
+        settings: of its integrator.
+
+    Raises:
+        ValueError: the scene cannot be rendered, or the file is damaged.
+    """
+    shapes = translucent_shapes(scene)
+    refuse_instances(scene, shapes, "the model 'auto'")
+    on = Stage(scene, shapes, settings.shared(), settings.of_models())
+    path = choices_folder() / f"{_identity(on, settings)}_walks.json"
+    if path.is_file():
+        try:
+            record = json.loads(path.read_text(encoding="utf-8"))
+            return str(record["light"]), str(record["why"])
+        except (OSError, KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{path} must be the record of a choice, got {error!r}; delete it") from error
+    lights = ("sampled", GATHERED) if settings.light == AUTO else ("sampled", settings.light)
+    job, candidates = Job(settings.tolerance), map(Technique.of, CANDIDATES)
+    chosen = [each for each in candidates if each.walks or each.light in lights]
+    light, why = walks_of(advise(assess_for(on, chosen, job, Effort()), job))
+    record = {"light": light, "why": why, "provenance": provenance(tolerance=settings.tolerance)}
+    write_atomically(path, json.dumps(record, indent=1) + "\n")
+    return light, why
+
+
+def walks_of(advice: Advice) -> tuple[str, str]:
+    """The light of the walks that are advised for all objects, and why; "" and "" where models are advised."""
+    if all(each.is_dark or not each.ways for each in advice.assessment.objects):
+        return "", ""
+    asked, some = f"{100 * advice.tolerance:.3g} %", advice.seconds < math.inf
+    if not some:
+        return "sampled", f"{PATH_TRACED}, light sampled, as nothing is known to keep {asked}"
+    if not advice.integrator.startswith(PATH_TRACED):
+        return "", ""
+    light = Technique.of(advice.integrator).light
+    return light, f"{PATH_TRACED}, light {light}, is the cheapest that keeps {asked}: {advice.seconds:.2g} s an image"
+
+
+def _may_keep(row: TechniqueTrade, tolerance: float) -> bool:
+    return row.bias2 - DOUBT * row.bias2_error <= tolerance**2
 
 
 def _default(names: list[str]) -> str:

@@ -169,6 +169,14 @@ def noise_of_parts(parts: tuple[RadianceEstimate, RadianceEstimate], b: Radiance
     return Number(max(found.value, 0.0), found.error)
 
 
+def with_prior(found: Number, error: float, doubt: float = 2.0) -> Number:
+    """With 0 ± `error` that was known before, by weights 1 / error²; alone where it is `doubt` of its errors off."""
+    if not abs(found.value) < doubt * found.error:
+        return found
+    share = error**2 / (error**2 + found.error**2)
+    return Number(share * found.value, found.error * share**0.5)
+
+
 def joined(parts: Sequence[RadianceEstimate]) -> RadianceEstimate:
     """All samples of several estimates at the same exits."""
     result = RadianceEstimate(*parts[0].first.shape)

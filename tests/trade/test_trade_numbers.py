@@ -12,17 +12,19 @@ from full_geometry.cli import trade
 from full_geometry.integrators.gathering import PART, Gathered, Gathering
 from full_geometry.trade import recommend
 from full_geometry.trade.advice import advise
-from full_geometry.trade.automatic import picked
+from full_geometry.trade.automatic import picked, walks_of
 from full_geometry.trade.contending import contenders, left_out, most_promising
 from full_geometry.trade.job import Job
 from full_geometry.trade.results import Assessment, ObjectTrade, TechniqueTrade, samples_for
 from full_geometry.trade.statistics import (
     FIREFLIES,
+    Number,
     RadianceEstimate,
     mean_square,
     mean_square_of_parts,
     noise_of_parts,
     relative_variance,
+    with_prior,
 )
 from full_geometry.trade.techniques import Technique
 
@@ -222,6 +224,36 @@ def test_auto_takes_gathered_light_only_where_it_is_asked_for_and_counts_its_pre
     assert picked(found, 0.1).seconds == pytest.approx(100 * 100 * 2e-6)
     assert picked(found, 0.1, "gathered").seconds == pytest.approx(4.0 + 100 * 100 * 1e-8)
     assert picked(found, 0.1, "gathered").sentence.startswith("object 'ball': neural, gathered, < 1.6 % off")
+
+
+@pytest.mark.parametrize(
+    ("ways", "light", "why"),
+    [([GOOD], "", ""), ([CHEAP], "sampled", ", light sampled, is the cheapest that keeps 10 %: 0.1 s an image"),
+     ([GOOD, ("path_traced, precomputed", 0.0, 0.0, 1e-7)], "precomputed", "keeps 10 %: 0.001 s an image")],
+)  # fmt: skip
+def test_auto_of_the_command_walks_where_that_is_the_cheapest_way(ways: list, light: str, why: str) -> None:
+    found = _assessment(*(each if isinstance(each, TechniqueTrade) else _way(*each) for each in ways))
+    told = walks_of(advise(found, Job(0.1)))
+    assert told[0] == light and told[1].endswith(why)
+
+
+def test_auto_walks_with_sampled_light_where_nothing_is_known_to_keep_the_tolerance() -> None:
+    blurred = _way("path_traced", 0.2, 0.01, 1e-5)
+    found = ObjectTrade("ball", (30.0, 40.0), 0.5, 100.0, (1.0,), (blurred,))
+    light, why = walks_of(advise(Assessment((found,), 1.0, 0.0, 0), Job(0.1)))
+    assert light == "sampled" and why == "path_traced, light sampled, as nothing is known to keep 10 %"
+
+
+def test_auto_knows_where_no_model_keeps_the_tolerance() -> None:
+    assert picked(_assessment(CHEAP).objects[0], 0.1).is_wrong
+    assert not picked(_assessment(CHEAP).objects[0], 0.2).is_wrong
+
+
+def test_a_bias_that_contradicts_what_was_known_is_told_as_measured() -> None:
+    assert with_prior(Number(3e-3, 1e-3), 1e-4) == (3e-3, 1e-3)
+    assert with_prior(Number(2e-4, 1e-4), 1e-4) == (2e-4, 1e-4)
+    agreed = with_prior(Number(1e-4, 1e-4), 1e-4)
+    assert agreed == pytest.approx((0.5e-4, 1e-4 / 2**0.5))
 
 
 @pytest.mark.parametrize(

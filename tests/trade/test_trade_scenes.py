@@ -12,13 +12,13 @@ from render_files import XML
 from typer.testing import CliRunner
 
 from figures import app as cli
-from full_geometry.trade import assess, flat, measuring, recommend, sampling
+from full_geometry.trade import assess, automatic, flat, measuring, recommend, sampling
 from full_geometry.trade.assessing import assess_stage
 from full_geometry.trade.exits import visible_exits
 from full_geometry.trade.images import small_images
 from full_geometry.trade.job import Effort, Job
 from full_geometry.trade.sampling import first_sample, sample_more
-from full_geometry.trade.techniques import Technique, stage
+from full_geometry.trade.techniques import PRECOMPUTED_WALKS, WALKS, Technique, stage
 from full_geometry.transport.models import model_names
 from halfspace_sss import Medium
 from halfspace_sss.physics.fresnel import F_r
@@ -240,6 +240,61 @@ def test_a_way_that_refuses_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setenv("HALFSPACE_SSS_WEIGHTS", str(tmp_path))
     found = assess(scene(), models=["full_geometry"], **QUICK).objects[0]
     assert "must be trained" in found.way("full_geometry").refusal
+
+
+def test_precomputed_light_of_walks_has_less_variance_and_no_bias_beside_its_noise() -> None:
+    on = stage(scene(light={"type": "envmap", "bitmap": mi.Bitmap(windows())}))
+    found = assess_stage(on, [WALKS, PRECOMPUTED_WALKS], Effort(samples=1024, exits=64)).objects[0]
+    row = found.way("path_traced, precomputed")
+    assert abs(row.bias2) < 4 * row.bias2_error < 0.1**2 and row.preparation > 0
+    assert row.variance + 4 * row.variance_error < 0.5 * found.traced.variance
+
+
+def test_walks_refuse_to_precompute_light_where_that_cannot_be() -> None:
+    ways = [WALKS, PRECOMPUTED_WALKS]
+    found = assess_stage(stage(scene(orders="multiple")), ways, Effort(samples=48, exits=32)).objects[0]
+    assert found.way("path_traced, precomputed").refusal.endswith("orders of object 'ball0' are 'multiple'")
+
+
+def test_light_that_is_kept_for_samples_is_precomputed_anew_where_an_emitter_has_changed() -> None:
+    loaded = mi.load_dict(scene({"sigma_s": 9.5, "sigma_a": 0.5, "eta": 1.3}))
+    walks = mi.load_dict({"type": "translucent_walk", "light": "precomputed", "hide_emitters": True})
+    (exits,) = visible_exits(loaded, list(loaded.shapes()), 0, 32, 0)
+    rays, means = exits.rays(64), []
+    walks.prepare(loaded, 2**18)
+    for _ in range(2):
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(1, exits.n * 64)
+        means.append(np.mean(np.array(walks.sample(loaded, sampler, rays)[0])))
+        parameters = mi.traverse(loaded)
+        parameters["light.radiance.value"] = 2 * parameters["light.radiance.value"]
+        parameters.update()
+    assert means[1] == pytest.approx(2 * means[0], rel=0.02)  # the same walks in the noise of another fill
+
+
+def test_auto_of_the_command_walks_and_finds_its_choice_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "ball.xml").write_text(XML)
+    told, known = ("precomputed", "path_traced, light precomputed, is the cheapest"), []
+    monkeypatch.setattr(automatic, "assess_for", lambda *args: known.append(args))
+    monkeypatch.setattr(automatic, "advise", lambda *args: None)
+    monkeypatch.setattr(automatic, "walks_of", lambda *args: told)
+    for _ in range(2):
+        result = CliRunner().invoke(cli.app, ["render", "ball.xml", "--model", "auto", "--spp", "1"])
+        assert result.exit_code == 0 and told[1] in result.output
+    about = json.loads((tmp_path / "render" / "ball_auto.json").read_text())
+    assert "TranslucentWalk" in about["integrator"] and len(known) == 1
+    assert [each.name for each in known[0][1]][:3] == ["path_traced", "path_traced, precomputed", "lambert"]
+
+
+RECORD = {"format": automatic.FORMAT, "light": "sampled", "models": ["neural"], "sentences": [""], "refusal": ""}
+
+
+def test_auto_inside_the_integrator_of_models_refuses_what_none_of_them_keeps(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(automatic, "_measured", lambda *args: {**RECORD, "refusal": "a model must keep the tolerance"})
+    loaded = mi.load_dict(scene(model="auto"))
+    with pytest.raises(ValueError, match="a model must keep the tolerance"):
+        loaded.integrator().prepare(loaded)
 
 
 def _painted(*albedos: float) -> dict[str, Any]:
