@@ -37,6 +37,7 @@ C = (1.0237, -0.1206, -1.8968, 1.1697)
 
 def quadratic_part(g: Any) -> tuple[Any, Any, Any]:
     """q_0, q_1, q_2 of the quadratic part of a Henyey-Greenstein function."""
+    # evaluate the polynomials by Horner's rule; q_l has the sign of g^l
     size = library(g).abs(g)
     a, b, c = (p[0] + size * (p[1] + size * (p[2] + size * p[3])) for p in (A, B, C))
     return (1 - size) * (1 + size * a), (1 - size) * g * b, (1 - size) * size * size * c
@@ -51,6 +52,7 @@ def kept_forward(cosine: mi.Float, g: mi.Spectrum) -> mi.Spectrum:
     """1 - q(c) = 1 - Q(c) / p(c) by channel: the forward share of an event that turns by this cosine."""
     result = []
     for value in g:
+        # 1 - Q(c) / p(c), with Q by its Legendre polynomials P_1 = c, P_2 = (3 c² - 1) / 2
         q_0, q_1, q_2 = quadratic_part(value)
         Q = (q_0 + 3 * q_1 * cosine + 2.5 * q_2 * (3 * dr.square(cosine) - 1)) / (4 * math.pi)
         result.append(1 - Q / eval_hg(cosine, value))
@@ -59,6 +61,7 @@ def kept_forward(cosine: mi.Float, g: mi.Spectrum) -> mi.Spectrum:
 
 def split_extinction(medium: Medium) -> np.ndarray:
     """q_0 sigma_s + sigma_a by channel, 1/mm: by what light is lost that only forward events may scatter."""
+    # of the events, the share 1 - q_0 scatters forwards and takes no light away
     sigma_s, sigma_t = np.atleast_1d(medium.sigma_s), np.atleast_1d(medium.sigma_t)
     q_0, _, _ = quadratic_part(np.broadcast_to(medium.g, sigma_t.shape).astype(float))
     return sigma_t - (1 - q_0) * sigma_s
@@ -91,6 +94,7 @@ class ForwardRun:
 
     def onward(self, along: mi.Vector3f) -> ForwardRun:
         """With the turn at the last event, after which the walk went along this direction."""
+        # share <- share (1 - q(c)), once for each turn
         kept = kept_forward(dr.dot(self.along, along), self.g)
         share = dr.select(self.turned, self.share * kept, self.share)
         return ForwardRun(share, self.along, self.g, dr.full(mi.Bool, False, dr.width(self.turned)))

@@ -72,6 +72,7 @@ class InsideCells:
             depth: below the surface, beyond which cells hold nothing, scene units.
         """
         h = grid_edge(box, h)
+        # lay the grid around the box, with an empty rim
         counts = np.ceil((box[1] - box[0]) / h + 2 * MARGIN).astype(int) + 2
         low = 0.5 * (box[0] + box[1]) - 0.5 * counts * h
         axes = _crossed(points, low, h, counts)
@@ -85,6 +86,7 @@ class InsideCells:
         whole[0] = False  # the cut ones
         inside = whole[parts]
 
+        # measure the inside of the cut cells, and drop those that hold none of it
         cells = np.flatnonzero(cut)
         moments = _measure(media, k, cells, axes[cells], low, h, counts)
         kept = moments[:, 0, 0] > 1e-6
@@ -94,6 +96,8 @@ class InsideCells:
         if inside.any():
             apart = distance_transform_cdt(~cut.reshape(counts[::-1]), "chessboard").ravel()
             inside &= (apart - 1) * h < depth
+
+        # number the cells that hold a part of the inside
         inside[cells] = True
         held = np.flatnonzero(inside)
         slot = np.full(counts.prod(), -1, dtype=np.int32)
@@ -214,6 +218,7 @@ def _own_hit(media: WalkMedia, k: mi.Int32, ray: mi.Ray3f) -> tuple[mi.Float, mi
 
 def _starts_inside(media: WalkMedia, k: int, p: mi.Point3f) -> np.ndarray:
     """Whether points away from the surface of object k are inside it: most of three rays leave it first."""
+    # three rays along the axes, slightly turned so that none runs in a face; most votes win over an unlucky edge
     votes = 0
     for axis in range(3):
         d = dr.normalize(mi.Vector3f(*(1.0 if a == axis else 0.0137 * (a + 1) for a in range(3))))

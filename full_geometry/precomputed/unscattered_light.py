@@ -77,6 +77,7 @@ class UnscatteredLight:
 
     def light(self, media: WalkMedia, event: Event) -> mi.Spectrum:
         """Unscattered light that an event of a walk scatters on along it, per weight of the walk."""
+        # ---- find the cell of the event, and its slot
         at = {key: dr.gather(type(t), t, media.place_of(event.object)) for key, t in self.tables.items()}
         x = (event.p - at["low"]) * at["scale"]
         cell = mi.Vector3i(dr.floor(x))
@@ -84,6 +85,8 @@ class UnscatteredLight:
         index = at["first"] + (cell.z * at["counts"].y + cell.y) * at["counts"].x + cell.x
         slot = dr.gather(mi.Int32, self.slot, index, inside)
         held, y = inside & (slot >= 0), x - (mi.Vector3f(cell) + 0.5)
+
+        # ---- evaluate the fluence there, phi(y) = phi_0 + s.y, y from the centre in units of h
         n = len(mi.Spectrum(0))
         rows = [dr.gather(mi.Vector4f, self.fluence, mi.UInt32(slot * n + c), held) for c in range(n)]
         phi = mi.Spectrum([v.x + v.y * y.x + v.z * y.y + v.w * y.z for v in rows])
@@ -116,6 +119,7 @@ def unscattered_light(
         cells: of the objects, from `inside_cells_of`.
         rays: of light, for each object.
     """
+    # ---- trace light into the cells of each object, and fit its fluence and directions in each cell
     directional = any(np.any(inside.medium.g) for inside in media.specs)
     slots, values, angles, first = [], [], [], 0
     rows = {"first": [], "low": [], "scale": [], "counts": []}
@@ -129,6 +133,8 @@ def unscattered_light(
         for key, value in (("first", first), ("low", grid.low), ("scale", 1 / grid.h), ("counts", grid.counts)):
             rows[key].append(value)
         first, start = first + slot.size, start + grid.slots
+
+    # ---- put the cells of all objects into one table
     kinds = {"first": mi.Int32, "low": mi.Point3f, "scale": mi.Float, "counts": mi.Vector3i}
     tables = {key: kind(np.array(rows[key]).T) for key, kind in kinds.items()}
     slot, *arrays = (
@@ -147,6 +153,7 @@ def _directions(w: np.ndarray, light: np.ndarray, grid: InsideCells) -> np.ndarr
         light: (slots, channels, 1) ∫ L_0 dw dx.
         grid: tells the cells that share the fit of another.
     """
+    # cells that share a fit have one distribution of directions: that of all their light
     w, light = (grid.shared(values) for values in (w, light))
     result = w / np.maximum(light, 1e-30)
     # where emitters have negative texels, moments are no longer those of a distribution
@@ -182,6 +189,7 @@ def inside_cells_of(media: WalkMedia) -> list[InsideCells]:
     """The cells of all objects."""
     results = []
     for k, kind in enumerate(media.instance_table.kind):
+        # scale the number of points by the surface in units of h², with its area from a few of them
         box, h = _edges(media, k)
         depth = np.inf if media.varies else DEPTH / float(np.min(_extinction(media, kind)))
         area = float(
@@ -315,7 +323,7 @@ class _Rays:
         """
         scene, instance_scene = self.scene, self.media.instance_scene
 
-        # ---- by the emitters
+        # ---- by the emitters, L without its density; delta lights have no other technique
         ds, light = scene.sample_emitter_direction(si, u, False)
         shadow = instance_scene.ray_to_emitter(si, ds, self.media.row("rounding", self.k))
         delta, active = mi.Bool(ds.delta), ds.pdf > 0
@@ -331,7 +339,7 @@ class _Rays:
         found = drawn & (emitter != None)  # noqa: E711
         there = mi.DirectionSample3f(scene, met, si)
 
-        # ---- over the density of both
+        # ---- balance heuristic over one sample: L / ((1 - b) p_emitter + b p_cosine), b = BY_COSINE
         p_emitter = dr.select(drawn, scene.pdf_emitter_direction(si, there, found), ds.pdf)
         w = mi.Vector3f(dr.select(drawn, w, ds.d))
         p_cosine = dr.select(delta & ~drawn, 0, cosine_density(si.sh_frame.n, si.n, w))
@@ -341,6 +349,7 @@ class _Rays:
 
     def segment(self, ray: _Ray) -> _Ray:
         """Light along a ray as far as the surface, and its reflection there."""
+        # ---- find the end of the segment
         media, d = self.media, ray.d
         si = media.instance_scene.intersect(
             media.scene, mi.Ray3f(ray.o + ray.off, d), mi.RayFlags.All, active=ray.alive
