@@ -113,9 +113,12 @@ def _class(variant: str) -> type:
                 scored: whether derivatives are asked for, which leave light to be sampled.
                 light: that is known already.
             """
+            # ---- objects and inner lights, made once for a scene
             self._prepared = _prepared(scene, self._prepared, self.mm_per_unit)
             media, small = self._prepared[-1], SmallEmitters.of(scene)
             inner = InnerLights.of(media, self.blur)
+
+            # ---- light inside, precomputed by as many rays as the image has samples for
             if samples and self.precomputes(scene, media):
                 if self._cells[0] is not media:
                     self._cells = media, inside_cells_of(media)
@@ -123,14 +126,28 @@ def _class(variant: str) -> type:
                     started, rays = clock(), min(max(samples // SAMPLES_PER_RAY, FEWEST_RAYS), MOST_RAYS)
                     light = unscattered_light(scene, media, seed, self._cells[1], rays)
                     self.filling = clock() - started
-                visitor = LightVisitor(scene, media, small, None, None, None, inner, self.blur, light)
+                visitor = LightVisitor(
+                    scene, media, small, connections=None, directions=None, inner_lights=inner, blur=self.blur,
+                    unscattered=light,
+                )  # fmt: skip
                 return PathTracer(visitor, self.max_depth, self.rr_depth, self.hidden, self.layers)
+
+            # ---- or sampled: connections with small emitters, directions to them, straight light
             connections = find_connections(scene, media, small, self.connection_share, scored)
             directions = connections and EmitterDirections(scene, media, small, scored)
             if scored and inner is not None:
                 raise ValueError("objects must hold no delta lights for derivatives of translucent_walk")
             straight = find_straight_light(scene, media, self.max_depth == FOREVER, scored)
-            visitor = LightVisitor(scene, media, small, connections, directions, straight, inner, self.blur)
+            visitor = LightVisitor(
+                scene,
+                media,
+                small,
+                connections,
+                directions,
+                straight_light=straight,
+                inner_lights=inner,
+                blur=self.blur,
+            )
             return PathTracer(visitor, self.max_depth, self.rr_depth, self.hidden, self.layers)
 
         def precomputes(self, scene: mi.Scene, media: WalkMedia) -> bool:
