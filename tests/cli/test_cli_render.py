@@ -61,10 +61,10 @@ def test_a_scene_that_cannot_be_rendered_ends_with_2_and_one_line(case: str, sce
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--orders", "nope"], "orders must be one of total, multiple, single, got 'nope'"),
-        (["--orders", "totl"], "did you mean 'total'?"),
+        (["--orders", "nope"], "'nope' is not one of 'total', 'multiple', 'single'"),
+        (["--model", "neurl"], "did you mean 'neural'?"),
         (["--variant", "llvm_ad_mono"], "channel must be given under a mono variant, got none for marble"),
-        (["--variant", "scalar_rgb"], "variant must be one of llvm_ad_rgb"),
+        (["--variant", "scalar_rgb"], "'scalar_rgb' is not one of 'llvm_ad_rgb'"),
         (["--target-error", "-1"], "target_error must be finite and > 0, got -1.0"),
         (["--target-error", "nan"], "target_error must be finite and > 0, got nan"),
         (["--target-error", "0"], "target_error must be finite and > 0, got 0.0"),
