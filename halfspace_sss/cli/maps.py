@@ -71,7 +71,7 @@ def maps(
         raise ValueError(f"name must be left out unless coefficients are given, got {name!r}")
     if name == "":
         raise ValueError("name must have a letter at least, got ''")
-    media = {re.sub(r"[^\w.-]+", "_", title if name is None else name): medium for title, medium in media.items()}
+    media = {re.sub(r"[^\w.-]+", "_", title) if name is None else name: medium for title, medium in media.items()}
     target = TARGET_ERROR if tracing.target_error is None and tracing.paths is None else tracing.target_error
     part = _share(share)
     check_folder(out)

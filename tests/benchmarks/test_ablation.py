@@ -256,7 +256,7 @@ REFUSED_BY_COMMAND = [
     (["--samples", "0"], "samples must be a whole number >= 1, got 0"),
     (["--seeds", "0"], "seeds must be a whole number >= 1, got 0"),
     (["--seed", "-1"], "seed must be a whole number >= 0, got -1"),
-    (["--backend", "opencl"], "backend must be one of llvm, cuda, got 'opencl'"),
+    (["--backend", "opencl"], "'opencl' is not one of 'llvm', 'cuda'"),
     (["--out", "file"], "folder must be a folder or new, got 'file'"),
 ]
 

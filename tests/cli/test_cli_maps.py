@@ -98,7 +98,7 @@ def test_a_store_of_other_parameters_is_refused_and_nothing_added(tmp_path: Path
         (["--target-error", "0"], "target_error must be a number in [0.0001, 1], got 0.0"),
         (["--paths", "5"], "n_paths must be a whole number >= 1024, got 5"),
         (["--seed", "-1"], "seed must be a whole number >= 0, got -1"),
-        (["--backend", "metal"], "backend must be one of llvm, cuda, got 'metal'"),
+        (["--backend", "metal"], "'metal' is not one of 'llvm', 'cuda'"),
         (["--out", "/dev/null/maps"], "folder must be a folder or new, got '/dev/null/maps'"),
     ],
 )
