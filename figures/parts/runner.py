@@ -112,7 +112,10 @@ def plan(name: str, quality: str, out: str | Path) -> Plan:
             missing.append(part.name)
     ahead = [part for part in parts if part.name in missing and not _elsewhere(folder / quality, part, keys[part.name])]
     seconds = projected(ahead, (PartStore(folder / each / "parts") for each in QUALITIES))
-    return Plan(name, quality, folder / quality, parts, keys, damaged, tuple(missing), seconds)
+    return Plan(
+        name=name, quality=quality, folder=folder / quality, parts=parts, keys=keys, damaged=damaged,
+        missing=tuple(missing), seconds=seconds,
+    )  # fmt: skip
 
 
 def compute(

@@ -67,7 +67,9 @@ def fit(
     names = [name.strip() for name in fitted.parameter.split(",")]
     with shared.Bar("fit") as bar:
         views = inverse.read_views(images)
-        found = inverse.fit(scene, views, names, fitted.model, fitted.object, settings, work, bar.show)
+        found = inverse.fit(
+            scene, views, names, fitted.model, object=fitted.object, settings=settings, work=work, progress=bar.show
+        )
     shared.say(*found.lines())
     for sentence in found.told:
         shared.tell(sentence)

@@ -135,7 +135,10 @@ def render(
             result = _rendered(loaded, file, limits, which, images.resume)
             emission = result.mean[..., -3:] if getattr(loaded.integrator(), "layers", False) else None
             told, error = _numbers(result), _error(result)
-            picture = Picture(file.stem, _colours(result.mean), told, error, loaded, k, images.denoise, emission)
+            picture = Picture(
+                title=file.stem, image=_colours(result.mean), numbers=told, caption=error, scene=loaded, sensor=k,
+                denoise=images.denoise, emission=emission,
+            )  # fmt: skip
             files = _publish(picture, file, drawers)
             shared.say(f"{result.spp} samples a pixel in {result.seconds:.1f} s; {error}")
             shared.say_files(files)

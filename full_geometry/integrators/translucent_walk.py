@@ -158,11 +158,13 @@ def _class(variant: str) -> type:
             Raises:
                 ValueError: `light` is "precomputed", and it cannot be in this scene.
             """
+            # nothing to precompute without objects
             if self.light == "sampled" or not media.objects or not len(media.scene.shapes()):
                 return False
             reason = obstacle(media)
             if reason and self.light == "precomputed":
                 raise ValueError(f"light must be auto or sampled, got 'precomputed': {reason}")
+            # an even sky alone is met by every walk, and light inside would only add its noise
             uneven = any("Constant" not in emitter.class_name() for emitter in scene.emitters())
             return not reason and (uneven or self.light == "precomputed")
 
@@ -265,11 +267,14 @@ def _class(variant: str) -> type:
 
 def _prepared(scene: mi.Scene, before: tuple, mm_per_unit: float) -> tuple[SceneMark, list, list, Any]:
     """Mark, shapes, places and media of a scene: those of before, unless shapes, inner lights or media changed."""
+    # ---- what was made before still holds
     shapes = scene.shapes()  # the scene itself, which holds its integrator, would never be freed
     mark, places = SceneMark(scene), places_of(scene)
     same = before[0] == mark and same_objects(before[1], shapes) and before[2] == places
     if before[3] is not None and same and before[3].is_current():
         return before
+
+    # ---- media anew, and warnings of cameras inside objects and of doubtful units
     media = WalkMedia.of(scene, mm_per_unit)
     check_sensors(scene, media.objects)
     for each, inside in zip(media.objects, media.specs):
@@ -298,6 +303,7 @@ def _check_followed(scene: mi.Scene) -> None:
         ValueError: gradients are enabled for another parameter than albedo, sigma_t and g of translucent surfaces and
             what their textures show, or a delta light stands inside an object.
     """
+    # ---- parameters whose scores walks know: of translucent surfaces, their textures, and attributes that these show
     parameters, owners, attributes = mi.traverse(scene), [], set()
     for shape in translucent_shapes(scene):
         textured = surface_of(shape).spec.textured
@@ -305,6 +311,8 @@ def _check_followed(scene: mi.Scene) -> None:
         for texture in textured.textures.values() if textured else ():
             owners += mi.traverse(texture).hierarchy
             attributes |= {(id(shape), name) for _, name in shown(texture)}
+
+    # ---- no other parameter may have gradients enabled
     for key, (_, _, owner, _) in parameters.properties.items():
         with dr.resume_grad():
             enabled = dr.grad_enabled(parameters[key])
@@ -324,6 +332,7 @@ def _render(
         if inside.spectral is not None:
             inside.spectral.check_covers(obj.name, sensor)
     sensor.film().prepare(LAYER if tracer.layers else [])
+    # launches are so small that their arrays fit, and that an interrupt is heard between them
     most = max(1, _on_device(SAMPLES_PER_LAUNCH) // int(dr.prod(sampled_size(sensor.film()))))
     for launch, start in enumerate(range(0, spp, most)):
         _launch(tracer, sensor, min(most, spp - start), (seed, launch), keep, scored)
@@ -340,6 +349,8 @@ def _launch(
     """Trace spp rays through each pixel and add them to the film, with derivatives if `scored`."""
     rays, weight, position = camera_rays(sensor, spp, seed)
     rays = tracer.shown(rays)
+
+    # ---- with derivatives: L + sum of scores times parameters, whose derivative is that of the mean
     if scored:
         media = tracer.visitor.media
         with dr.resume_grad():
@@ -348,6 +359,8 @@ def _launch(
         with dr.resume_grad():
             splat(sensor.film(), rays, with_derivatives(L, scores, media) * weight, seen, position, spp)
         return
+
+    # ---- without, and with the layer of emission
     exits = FirstExits.of(tracer.visitor.scene, tracer.visitor.media, rays) if keep else None
     L, seen, emission = tracer.trace(rays, _on_device(LANES), seed, exits)
     if keep:

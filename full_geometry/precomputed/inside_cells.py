@@ -103,7 +103,10 @@ class InsideCells:
         slot = np.full(counts.prod(), -1, dtype=np.int32)
         slot[held] = np.arange(len(held))
         place, offset = _parents(cells, moments[:, 0, 0], counts)
-        return cls(low, h, counts, mi.Int32(slot), len(held), slot[cells], place, offset, moments)
+        return cls(
+            low=low, h=h, counts=counts, slot=mi.Int32(slot), slots=len(held), cut=slot[cells], place=place,
+            offset=offset, moments=moments,
+        )  # fmt: skip
 
     def fit(self, D: np.ndarray) -> np.ndarray:
         """Of least squares over the inside, the value at the centre of each cell and its slopes by units of h.

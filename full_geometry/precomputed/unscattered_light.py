@@ -311,8 +311,8 @@ class _Rays:
         T = dr.full(mi.Spectrum, 1, rays)
         channel = dr.minimum(mi.UInt32(rng.next_float32() * len(T)), len(T) - 1)
         return _Ray(
-            mi.Point3f(at.p), d, media.clear(self.k, si.n, d), mi.Spectrum(flux), T, dr.max(flux), channel,
-            mi.Spectrum(T), mi.Bool(enters), rng,
+            o=mi.Point3f(at.p), d=d, off=media.clear(self.k, si.n, d), flux=mi.Spectrum(flux), T=T,
+            entered=dr.max(flux), channel=channel, density=mi.Spectrum(T), alive=mi.Bool(enters), rng=rng,
         )  # fmt: skip
 
     def _incident(self, si: mi.SurfaceInteraction3f, u: mi.Point2f, rng: mi.PCG32) -> tuple[mi.Vector3f, mi.Spectrum]:

@@ -143,7 +143,10 @@ def identify(obj: TranslucentObject) -> Identity:
     contents, more = _contents(obj, anchors)
     anchors = np.concatenate([anchors, *more]).astype(np.float32)
     kind = obj.geometry.shape.class_name()
-    return Identity(kind, topology, anchors, medium, grids, probes, contents, _digest_of_textures(obj))
+    return Identity(
+        kind=kind, topology=topology, anchors=anchors, medium=medium, grids=grids, probes=probes, contents=contents,
+        textures=_digest_of_textures(obj),
+    )  # fmt: skip
 
 
 def _anchored(shape: mi.Shape) -> tuple[str, np.ndarray]:

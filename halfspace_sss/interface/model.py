@@ -120,7 +120,9 @@ class BSSRDF(abc.ABC):
         r, mu_i, phi_i, mu_o, phi_o = args
         sigma_t = lib.constant(self.medium.sigma_t, r)
         r = lib.minimum(r, lib.largest(r) ** FARTHEST / sigma_t)
-        q = Query(lib, sigma_t * r, mu_i, phi_i, mu_o, phi_o, self.medium.eta, r, self.medium.sigma_t)
+        q = Query(
+            lib, sigma_t * r, mu_i, phi_i, mu_o, phi_o, self.medium.eta, r_mm=r, sigma_t=self.medium.sigma_t
+        )  # fmt: skip
         G = lib.like(G_of(q), r)
         return sigma_t * sigma_t * F_t(mu_i, q.index) * F_t(mu_o, q.index) * G
 
