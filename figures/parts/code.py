@@ -18,6 +18,7 @@ from typing import NamedTuple
 PACKAGES = ("benchmarks", "figures", "full_geometry", "analytic_models", "halfspace_sss")
 IDLE = {"cli", "curve_plot", "drawing", "parts", "style"}  # rooms and modules that compute nothing of a result
 MODELS = ("analytic_models", "halfspace_sss.neural")
+REGISTRY = "halfspace_sss.registry"  # imports the list of networks, which is no use of them
 OBJECT_MODELS = ("full_geometry.transport", "full_geometry.learning", "full_geometry.trade.automatic")
 ADDRESS = re.compile(r"([a-z_]\w*(?:\.\w+)+)(?::\w+)?")
 
@@ -53,7 +54,10 @@ def modules_of(names: Iterable[str], unmodelled: bool = False) -> list[str]:
         if _path(name):
             found.add(name)
             source = _file(name)
-            ahead += [*source.imports, *(() if unmodelled else source.addresses)]
+            used = (
+                source.imports if name != REGISTRY else {each for each in source.imports if not each.startswith(MODELS)}
+            )
+            ahead += [*used, *(() if unmodelled else source.addresses)]
             if name.startswith("full_geometry") and not unmodelled:
                 ahead += _members(OBJECT_MODELS)
             continue

@@ -244,7 +244,9 @@ def test_what_is_left_of_a_phase_function_is_forward_and_at_most_all_of_it(g: fl
 FORWARD = {"sigma_s": "10.0,15.0,20.0", "sigma_a": "0.01,0.05,0.3", "eta": 1.4}
 
 
-@pytest.mark.parametrize("g", ["0.9", "0.95,0.8,0.6", "-0.6"])
+@pytest.mark.parametrize(
+    "g", [pytest.param("0.9", marks=pytest.mark.slow), pytest.param("0.95,0.8,0.6", marks=pytest.mark.slow), "-0.6"]
+)
 def test_precomputed_light_of_an_even_sky_has_the_mean_of_sampled_light_at_any_g(g: str) -> None:
     surface = {**(MEDIUM if g == "-0.6" else FORWARD), "g": g}
     _compare(surface, 0.003, spp=1024, light={"type": "constant"})
