@@ -231,22 +231,18 @@ def test_a_model_of_the_half_space_and_textures_see_stretched_and_mirrored_insta
 
 
 @pytest.mark.slow
-def test_an_object_is_learnt_once_for_all_its_instances(monkeypatch: Any, tmp_path: Any) -> None:
+def test_an_object_that_is_learnt_once_is_known_in_all_its_instances(monkeypatch: Any, tmp_path: Any) -> None:
     training = pytest.importorskip("full_geometry.learning.training")
+    from full_geometry.objects.objects import object_of
     from halfspace_sss.neural import store
 
-    learnt, train = [], training.train
     quick = replace(training.STANDARD, width=16, depth=2, batch=1024, chunk=2**12)
-
-    def counted(obj: Any, **how: Any) -> Any:
-        learnt.append(obj.geometry.name)
-        return train(obj, chunks=4, recipe=quick)
-
-    monkeypatch.setattr(training, "train", counted)
     monkeypatch.setattr(training, "WALKS", 512)
     monkeypatch.setenv(store.ENVIRONMENT_VARIABLE, str(tmp_path))
-    agree(*seen("full_geometry", places()), 0.01)
-    assert learnt == ["'box'"]  # what stands there is the same object too
+    parts = {"box": box(bsdf=surface("full_geometry", "total"))}
+    group = mi.load_dict(view("bssrdf", **light(), **shown(parts, places())), optimize=False)
+    training.train(object_of(group, None, None, "box"), chunks=4, recipe=quick)
+    agree(*seen("full_geometry", places()), 0.01)  # what stands there is the same object too
 
 
 @pytest.mark.slow
