@@ -321,7 +321,9 @@ def test_a_textured_object_is_assessed_by_the_ways_that_take_it() -> None:
 
 @pytest.mark.slow
 def test_auto_of_a_textured_object_is_a_model_that_takes_textures() -> None:
-    loaded = mi.load_dict(scene(_painted(0.95, 0.5), model="auto"))
+    painted = scene(_painted(0.95, 0.5), model="auto")
+    painted["integrator"]["tolerance"] = 0.4  # a small ball: models of the half-space are 14 % off
+    loaded = mi.load_dict(painted)
     (obj,) = loaded.integrator().prepare(loaded)
     assert obj.textured is not None and obj.transport is not None
     assert np.isfinite(mi.render(loaded, spp=1).numpy()).all()
