@@ -126,28 +126,19 @@ def _class(variant: str) -> type:
                     started, rays = clock(), min(max(samples // SAMPLES_PER_RAY, FEWEST_RAYS), MOST_RAYS)
                     light = unscattered_light(scene, media, seed, self._cells[1], rays)
                     self.filling = clock() - started
-                visitor = LightVisitor(
-                    scene, media, small, connections=None, directions=None, inner_lights=inner, blur=self.blur,
-                    unscattered=light,
-                )  # fmt: skip
-                return PathTracer(visitor, self.max_depth, self.rr_depth, self.hidden, self.layers)
+                connections, directions, straight = None, None, None
 
             # ---- or sampled: connections with small emitters, directions to them, straight light
-            connections = find_connections(scene, media, small, self.connection_share, scored)
-            directions = connections and EmitterDirections(scene, media, small, scored)
-            if scored and inner is not None:
-                raise ValueError("objects must hold no delta lights for derivatives of translucent_walk")
-            straight = find_straight_light(scene, media, self.max_depth == FOREVER, scored)
+            else:
+                connections, light = find_connections(scene, media, small, self.connection_share, scored), None
+                directions = connections and EmitterDirections(scene, media, small, scored)
+                if scored and inner is not None:
+                    raise ValueError("objects must hold no delta lights for derivatives of translucent_walk")
+                straight = find_straight_light(scene, media, self.max_depth == FOREVER, scored)
             visitor = LightVisitor(
-                scene,
-                media,
-                small,
-                connections,
-                directions,
-                straight_light=straight,
-                inner_lights=inner,
-                blur=self.blur,
-            )
+                scene=scene, media=media, small=small, connections=connections, directions=directions,
+                straight_light=straight, inner_lights=inner, blur=self.blur, unscattered=light,
+            )  # fmt: skip
             return PathTracer(visitor, self.max_depth, self.rr_depth, self.hidden, self.layers)
 
         def precomputes(self, scene: mi.Scene, media: WalkMedia) -> bool:

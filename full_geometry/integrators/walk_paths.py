@@ -171,7 +171,7 @@ class LightVisitor:
             return walk, record
         # next-event estimation through a rough boundary from inside, of what is not precomputed
         if self.forward:
-            record = replace(record, run=record.run.onward(-si.to_world(si.wi)))
+            record = replace(record, run=record.run.onward(walk.d))
         left = self.left(record)
         light = self.sampled_emitter(walk, si, self.media.boundary(walk.object), active & (dr.max(dr.abs(left)) > 0))
         return walk, replace(record, L=record.L + left * light)
@@ -183,6 +183,8 @@ class LightVisitor:
 
     def left(self, record: LightRecord) -> mi.Spectrum:
         """The share of the emission met next that is not precomputed."""
+        if self.unscattered is None:
+            return mi.Spectrum(1)
         return dr.select(record.precomputed, record.run.share if self.forward else mi.Spectrum(0), mi.Spectrum(1))
 
     def surface(

@@ -64,10 +64,7 @@ def choose(scene: mi.Scene, settings: Settings) -> Choices:
         ValueError: the scene cannot be rendered, models are known not to keep the tolerance, or the file of an earlier
             choice is damaged.
     """
-    shapes = translucent_shapes(scene)
-    refuse_instances(scene, shapes, "the model 'auto'")
-    on = Stage(scene, shapes, settings.shared(), settings.of_models())
-    named = models_of(scene, settings)
+    on, named = _stage(scene, settings), models_of(scene, settings)
     path = choices_folder() / f"{_identity(on, settings)}.json"
     record = _read(path) if path.is_file() else None
     if record is None or len(record["models"]) != len(named):
@@ -84,6 +81,13 @@ def choose(scene: mi.Scene, settings: Settings) -> Choices:
 def models_of(scene: mi.Scene, settings: Settings) -> list[str]:
     """What the integrator or the surfaces of a scene name as the model of each translucent object."""
     return [settings.model or surface_of(shape).spec.model for shape in translucent_shapes(scene)]
+
+
+def _stage(scene: mi.Scene, settings: Settings) -> Stage:
+    """The scene as techniques are measured on it; ValueError if instances show an object."""
+    shapes = translucent_shapes(scene)
+    refuse_instances(scene, shapes, "the model 'auto'")
+    return Stage(scene, shapes, settings.shared(), settings.of_models())
 
 
 def _identity(on: Stage, settings: Settings) -> str:
@@ -205,9 +209,7 @@ def walks_instead(scene: mi.Scene, settings: Settings) -> tuple[str, str]:
     Raises:
         ValueError: the scene cannot be rendered, or the file is damaged.
     """
-    shapes = translucent_shapes(scene)
-    refuse_instances(scene, shapes, "the model 'auto'")
-    on = Stage(scene, shapes, settings.shared(), settings.of_models())
+    on = _stage(scene, settings)
     path = choices_folder() / f"{_identity(on, settings)}_walks.json"
     if path.is_file():
         try:
