@@ -17,35 +17,7 @@ from figures import app as cli
 
 ROOT = Path(__file__).resolve().parent.parent
 LINES, WORDS = 170, 25  # most of README.md, and of a sentence on average
-PAGES = [
-    "README.md",
-    *(
-        f"docs/{name}.md"
-        for name in (
-            "index",
-            "start",
-            "gallery",
-            "notebooks",
-            "curves",
-            "materials",
-            "rendering",
-            "choosing",
-            "train",
-            "add_model",
-            "tracing",
-            "biomedical",
-            "figures",
-            "cluster",
-            "inverse",
-            "conventions",
-            "learnt_models",
-            "errors",
-            "formats",
-            "limits",
-            "measurements",
-        )
-    ),
-]
+PAGES = ["README.md", *(str(path.relative_to(ROOT)) for path in sorted((ROOT / "docs").glob("*.md")))]
 TEXTS = {page: (ROOT / page).read_text(encoding="utf-8") for page in PAGES}
 BLOCKS = {page: re.findall(r"^```(\w+)\n(.*?)^```", text, flags=re.M | re.S) for page, text in TEXTS.items()}
 SNIPPETS = {
