@@ -140,9 +140,9 @@ class Incident:
 
 def bent(w: mi.Vector3f, n_out: mi.Normal3f, eta: float) -> mi.Vector3f:
     """A direction outside as the boundary bends it, turned back to the outer side."""
-    # Snell: mu_t² = 1 - (1 - mu²) / eta²
+    # Snell: mu_t² = 1 - (1 - mu²) / eta², and 0 where all is reflected (eta < 1), of weight F_t = 0
     mu = dr.dot(w, n_out)
-    mu_t = dr.sqrt(1 - (1 - dr.minimum(dr.square(mu), 1)) * opaque(eta**-2))
+    mu_t = dr.safe_sqrt(1 - (1 - dr.minimum(dr.square(mu), 1)) * opaque(eta**-2))
     return mi.Vector3f((w - mu * n_out) * opaque(1 / eta) + mu_t * n_out)
 
 
@@ -454,7 +454,7 @@ def _bent(w: np.ndarray, n: np.ndarray, eta: float) -> np.ndarray:
     """`bent` of arrays (..., 3)."""
     # w / eta + (sqrt(1 - (1 - mu²) / eta²) - mu / eta) n
     mu = np.einsum("...k,...k->...", w, n)[..., None]
-    return w / eta + (np.sqrt(1 - np.maximum(1 - mu**2, 0) / eta**2) - mu / eta) * n
+    return w / eta + (np.sqrt(np.maximum(1 - np.maximum(1 - mu**2, 0) / eta**2, 0)) - mu / eta) * n
 
 
 def _summed(step: np.ndarray, values: np.ndarray, size: int) -> np.ndarray:

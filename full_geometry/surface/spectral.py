@@ -170,4 +170,4 @@ def _number_or_texture(props: mi.Properties, key: str) -> float | mi.Texture:
 def read_file(props: mi.Properties) -> SpectralMedium:
     """The medium of the file `spectra`, see `materials.read_spectra`, with mu_a and mu_s in `unit`; errors as there."""
     path = mi.file_resolver().resolve(str(props["spectra"]))
-    return read_spectra(str(path), str(props.get("unit", "1/mm")))
+    return read_spectra(str(path), str(props["unit"]) if "unit" in props else None)

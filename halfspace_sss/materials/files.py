@@ -12,7 +12,7 @@ from pydantic_core import ErrorDetails
 
 from halfspace_sss.checks import did_you_mean
 from halfspace_sss.materials.material import Material
-from halfspace_sss.physics.medium import Medium
+from halfspace_sss.physics.medium import CLEAR, Medium
 from halfspace_sss.provenance import read_text
 
 if sys.version_info >= (3, 11):
@@ -124,7 +124,8 @@ def _problem(error: ErrorDetails, raw: dict) -> str:
     if error["type"] == "missing":
         return f"{where}key {key} is required, got nothing"
     message = error["msg"][0].lower() + error["msg"][1:]
-    return f"{where}key {key or '[[material]]'}: {message}, got {repr(error['input'])[:80]}"
+    ballistic = f"; with g = 1 nothing is scattered: {CLEAR}" if key.startswith("g") and error["input"] == 1 else ""
+    return f"{where}key {key or '[[material]]'}: {message}, got {repr(error['input'])[:80]}{ballistic}"
 
 
 def _material(file: MaterialFile, entry: Entry) -> Material:

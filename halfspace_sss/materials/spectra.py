@@ -22,7 +22,9 @@ from halfspace_sss.provenance import read_text
 
 PER_MM = {"1/mm": 1.0, "1/cm": 10.0}
 SHORTEST = 100.0  # nm, of a medium; less looks like µm
+STRONGEST = 10.0  # mu_s' in 1/mm; tissues have at most 7 at 500 nm (skin, Jacques 2013), so more looks like 1/cm
 COLUMNS = ("wavelength", "mu_a", "mu_s", "g", "n")
+REDUCED = ("mu_s'", "mu_s_prime")  # columns that may stand for mu_s
 VISIBLE = (400.0, 700.0)  # nm; outside, colour-matching functions are below 2 % of their maximum, 4 % for z
 XYZ_TO_RGB = np.array(  # linear sRGB, IEC 61966-2-1
     [[3.2404542, -1.5371385, -0.4985314], [-0.9692660, 1.8760108, 0.0415560], [0.0556434, -0.2040259, 1.0572252]]
@@ -204,37 +206,53 @@ def _observer() -> tuple[np.ndarray, np.ndarray]:
     return rows[:, 0], (rows[:, 1:4] * rows[:, 4:]).T
 
 
-def read_spectra(path: str | os.PathLike, unit: str = "1/mm") -> SpectralMedium:
+def read_spectra(path: str | os.PathLike, unit: str | None = None) -> SpectralMedium:
     """Spectra of a CSV file with the columns wavelength (nm), mu_a, mu_s, g and n; lines that begin with # are skipped.
+
+    A column mu_s' (or mu_s_prime) in place of mu_s is reduced scattering: mu_s = mu_s' / (1 - g).
 
     Args:
         path: the file.
-        unit: of mu_a and mu_s, "1/mm" or "1/cm".
+        unit: of mu_a and scattering, "1/mm" or "1/cm"; without it 1/mm, and a warning where no tissue scatters so much.
 
     Raises:
         ValueError: the file cannot be read, a column is missing or unknown, or a value is no number or out of range;
             file, row and column are named.
     """
-    check_choice("unit", unit, PER_MM)
+    if unit is not None:
+        check_choice("unit", unit, PER_MM)
     try:
         lines = read_text(Path(path)).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: must be a readable CSV file in UTF-8, got {error}") from error
     rows = csv.DictReader([line for line in lines if line.strip() and not line.startswith("#")], skipinitialspace=True)
     names = [name.strip() for name in rows.fieldnames or ()]
-    if sorted(names) != sorted(COLUMNS):
-        raise ValueError(f"{path}: columns must be {', '.join(COLUMNS)}, got {', '.join(names) or 'none'}")
-    rows.fieldnames = names
+    reduced = any(name in REDUCED for name in names)
+    rows.fieldnames = ["mu_s" if name in REDUCED else name for name in names]
+    if sorted(rows.fieldnames) != sorted(COLUMNS):
+        raise ValueError(
+            f"{path}: columns must be {', '.join(COLUMNS)}, or mu_s' for mu_s, got {', '.join(names) or 'none'}"
+        )
     values = {name: [] for name in COLUMNS}
     for k, row in enumerate(rows, 1):
         for name in COLUMNS:
             values[name].append(_cell(row[name], f"{path}, row {k}: {name}"))
-    scale = PER_MM[unit]
+    scale, g = PER_MM[unit or "1/mm"], np.array(values["g"])
+    mu_s, mu_a = np.array(values["mu_s"]) / scale, np.array(values["mu_a"]) / scale
+    if reduced:
+        mu_s = mu_s / np.where(np.abs(g) < 1, 1 - g, 1)
     try:
-        mu_s, mu_a = np.array(values["mu_s"]) / scale, np.array(values["mu_a"]) / scale
-        return SpectralMedium(values["wavelength"], mu_s, mu_a, values["g"], values["n"], source=str(path))
+        medium = SpectralMedium(values["wavelength"], mu_s, mu_a, g, values["n"], source=str(path))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+    strength = float(np.mean(medium.sigma_s * (1 - medium.g)))
+    if unit is None and strength > STRONGEST:
+        warnings.warn(
+            f"{path}: no tissue has mu_s' = {strength:.3g} 1/mm (mean over wavelengths), at most {STRONGEST:g}: values "
+            "in 1/cm need unit '1/cm', others unit '1/mm'",
+            stacklevel=2,
+        )
+    return medium
 
 
 def _cell(text: str | None, where: str) -> float:

@@ -16,7 +16,7 @@ class Layers:
 
     Args:
         media: scalar media (or materials with one channel); the eta of each is its index over that above the plane,
-            at least 1, so that the step from layer k to the next is eta_{k+1} / eta_k.
+            at least 1, so that the step from layer k to the next is eta_{k+1} / eta_k. A clear one has sigma_s = 1e-9.
         thickness: of each layer in mm, > 0. With one number fewer than media the last layer is semi-infinite; with as
             many the stack is a slab.
         eta_below: index below a slab over that above the plane, > 0.

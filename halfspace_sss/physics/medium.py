@@ -15,11 +15,13 @@ import numpy as np
 from halfspace_sss.arrays import Real, library
 from halfspace_sss.physics.reflectance import DIFFUSE, albedo_of_reflectance, half_space_reflectance
 
+CLEAR = "a clear layer is sigma_s = 1e-9, g = 0"
 
-def _check(name: str, value: np.ndarray, ok: np.ndarray, bound: str) -> None:
+
+def _check(name: str, value: np.ndarray, ok: np.ndarray, bound: str, hint: str = "") -> None:
     if not np.all(ok):
         bad = np.atleast_1d(value)[~np.atleast_1d(ok)][0]
-        raise ValueError(f"{name} must be {bound}, got {bad.item()!r}")
+        raise ValueError(f"{name} must be {bound}, got {bad.item()!r}{hint}")
 
 
 def _number(name: str, value: object) -> np.ndarray:
@@ -87,7 +89,8 @@ class Medium:
         for name in ("sigma_s", "sigma_a"):
             value = fields[name]
             _check(name, value, np.isfinite(value) & (value >= 0), "finite and >= 0 (1/mm)")
-        _check("g", fields["g"], np.abs(fields["g"]) < 1, "in the open interval (-1, 1)")
+        hint = f"; with g = 1 nothing is scattered: {CLEAR}" if np.any(fields["g"] == 1) else ""
+        _check("g", fields["g"], np.abs(fields["g"]) < 1, "in the open interval (-1, 1)", hint)
         shape = _common_shape(**fields)
         if shape == (0,):
             raise ValueError("sigma_s must have at least one channel, got none")
@@ -100,7 +103,8 @@ class Medium:
         sigma_t = np.asarray(self.sigma_t)
         with np.errstate(divide="ignore", over="ignore"):
             ok = np.isfinite(sigma_t) & (sigma_t > 0) & np.isfinite(1 / sigma_t)
-        _check("sigma_t = sigma_s + sigma_a", sigma_t, ok, "finite and > 0 (1/mm), and 1 / sigma_t finite")
+        hint = "" if np.any(sigma_t > 0) else f"; {CLEAR}"
+        _check("sigma_t = sigma_s + sigma_a", sigma_t, ok, "finite and > 0 (1/mm), and 1 / sigma_t finite", hint)
 
     @classmethod
     def from_albedo(cls, albedo, sigma_t, g=0.0, eta=1.3) -> Medium:

@@ -113,6 +113,7 @@ WRONG = {
     ),
     "not finite": ("13.0", "inf", "material 'soap', key sigma_s_prime[0]: input should be a finite number, got inf"),
     "g": ("-0.5", "-1.0", "material 'wax', key g[2]: input should be greater than -1, got -1.0"),
+    "clear gel": ("-0.5", "1.0", "got 1.0; with g = 1 nothing is scattered: a clear layer is sigma_s = 1e-9, g = 0"),
     "eta": ("eta = 1.4", "eta = 0.0", "key eta: input should be greater than 0, got 0.0"),
     "no eta": ("eta = 1.4", "", "material 'soap': key eta is required"),
     "text": ("13.0", '"13"', "material 'soap', key sigma_s_prime[0]: input should be a valid number, got '13'"),

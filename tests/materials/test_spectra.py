@@ -66,13 +66,33 @@ def test_three_wavelengths_differ_from_the_colour_and_say_by_how_much() -> None:
 def test_a_file_comes_back_in_both_units(tmp_path: Path) -> None:
     path = tmp_path / "skin.csv"
     path.write_text("# measured\nwavelength, mu_a, mu_s, g, n\n400, 5, 200, 0.8, 1.4\n700, 1, 100, 0.9, 1.38\n")
-    per_cm, per_mm = read_spectra(path, "1/cm"), read_spectra(path)
+    per_cm, per_mm = read_spectra(path, "1/cm"), read_spectra(path, "1/mm")
     assert np.allclose(per_cm.sigma_s, [20, 10]) and np.allclose(per_mm.sigma_a, [5, 1])
     assert np.allclose(per_mm.g, [0.8, 0.9]) and np.allclose(per_mm.n, [1.4, 1.38]) and str(path) in per_mm.source
 
 
+@pytest.mark.parametrize("column", ["mu_s'", "mu_s_prime"])
+def test_a_column_of_reduced_scattering_is_read_by_its_own_name(column: str, tmp_path: Path) -> None:
+    path = tmp_path / "skin.csv"
+    path.write_text(f"wavelength,mu_a,{column},g,n\n400,.5,4,0.8,1.4\n700,.1,1,0.9,1.4\n")
+    assert np.allclose(read_spectra(path).sigma_s, [20, 10])
+    path.write_text(f"wavelength,mu_a,{column},mu_s,g,n\n400,.5,4,20,0.8,1.4\n700,.1,1,10,0.9,1.4\n")
+    with pytest.raises(ValueError, match="columns must be wavelength, mu_a, mu_s, g, n, or mu_s' for mu_s, got"):
+        read_spectra(path)
+
+
+def test_coefficients_that_no_tissue_has_are_told_where_no_unit_was_given(tmp_path: Path) -> None:
+    """Skin of Jacques 2013 in 1/cm: sigma_s' = 46 (l / 500 nm)^-1.421."""
+    path, lines = tmp_path / "skin.csv", ["wavelength,mu_a,mu_s',g,n"]
+    path.write_text("\n".join(lines + [f"{nm},.5,{46 * (nm / 500) ** -1.421},0.8,1.4" for nm in (400, 500, 600, 700)]))
+    with pytest.warns(UserWarning, match=r"no tissue has mu_s' = 43\.3 1/mm .* need unit '1/cm'"):
+        wrong = read_spectra(path)
+    assert np.allclose(read_spectra(path, "1/mm").sigma_s, wrong.sigma_s)  # asked for by name: no warning
+    assert np.allclose(read_spectra(path, "1/cm").sigma_s, wrong.sigma_s / 10)
+
+
 FILES = [
-    ("wavelength,mu_a,mu_s,g\n400,1,1,0\n", "columns must be wavelength, mu_a, mu_s, g, n, got wavelength"),
+    ("wavelength,mu_a,mu_s,g\n400,1,1,0\n", "columns must be wavelength, .*, or mu_s' for mu_s, got"),
     ("", "columns must be .* got none"),
     ("wavelength,mu_a,mu_s,g,n\n400,1,x,0,1\n500,1,1,0,1\n", "row 1: mu_s must be a number, got 'x'"),
     ("wavelength,mu_a,mu_s,g,n\n400,1,1,0\n", "row 1: n must be a number, got None"),

@@ -76,6 +76,16 @@ def test_it_is_as_bright_as_the_model_sampled_within_3_percent(model: str, light
     assert (np.abs((one + two) / (a + b) - 1) < 0.03 + 4 * noise / (a + b)).all()
 
 
+def test_it_is_as_bright_as_the_model_sampled_where_the_index_is_below_that_outside() -> None:
+    """Wax in glass: beyond the critical angle outside no direction is bent inwards, and none counts."""
+    wax = {**MEDIUM, "eta": 0.9}
+    sampled, gathered = (_scene(kind, lights=_lights("lamp"), surface=wax) for kind in ("sampled", "gathered"))
+    a, b, g = _image(sampled, 2**10, 1), _image(sampled, 2**10, 2), _image(gathered)
+    mean = (a + b).mean(axis=(0, 1)) / 2
+    noise = np.abs(a - b).mean(axis=(0, 1)) / 2
+    assert (np.abs(g.mean(axis=(0, 1)) / mean - 1) < 0.03 + 4 * noise / mean).all()
+
+
 OTHERS = [pytest.param(*case, marks=pytest.mark.slow) for case in (("neural", "sky"), ("better_dipole", "point"))]
 
 

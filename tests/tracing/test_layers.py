@@ -219,3 +219,15 @@ def test_what_was_not_asked_of_layers_is_refused() -> None:
         run.exitance()
     with pytest.raises(ValueError, match="order must be one of unscattered, single, multiple, total"):
         run.reflectance("all")
+
+
+def test_a_clear_layer_is_one_that_hardly_scatters_and_refusals_say_so() -> None:
+    """Of one index with the medium below it, it changes no more than noise."""
+    wax = Medium(1.0, 0.01, 0.5, 1.4)
+    bare = trace(Layers([wax], [2.0]), 1.0, 200_000, 311)
+    under = trace(Layers([Medium(1e-9, 0.0, 0.0, 1.4), wax], [1.0, 2.0]), 1.0, 200_000, 312)
+    assert abs(z(under.reflectance(), bare.reflectance())) < 4
+    assert under.absorptance().value[0] == 0
+    for sigma_s, g in ((0.0, 0.0), (1.0, 1.0)):
+        with pytest.raises(ValueError, match="a clear layer is sigma_s = 1e-9, g = 0"):
+            Medium(sigma_s, 0.0, g, 1.4)
