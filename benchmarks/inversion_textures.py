@@ -14,10 +14,10 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
+from benchmarks.published import deng
 from figures.beyond.textures import bands, mosaic
 from figures.computing.scenes import BUNNY, MM_PER_UNIT
 from figures.parts.records import Row, SceneDict
-from figures.rivals import deng
 from full_geometry import inverse
 from full_geometry.geometry.mesh import vertex_positions
 from full_geometry.inverse.views import GivenView

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from figures.modelling.closed_shapes import SHAPES, SIZE, write_shape
+from benchmarks.closed_shapes import SHAPES, SIZE, write_shape
 from halfspace_sss.checks import check_count
 from halfspace_sss.provenance import JsonDict, write_atomically
 

@@ -16,7 +16,7 @@ from benchmarks.alpha_p import fit_alpha_p
 from benchmarks.flow import FlowProposals, FlowSampler
 from benchmarks.flow_training import FlowRecipe, Lighting, fit_flow
 from benchmarks.lightings import LIGHTINGS, fit_patches, lighting
-from figures.rivals.paper_network import PaperNetwork, PaperRecipe, estimate, fit_paper
+from benchmarks.published.paper_network import PaperNetwork, PaperRecipe, estimate, fit_paper
 from full_geometry.geometry.points import (
     ObjectModel,
     PositionSampler,

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from figures.modelling.held_out import HELD_OUT
+from benchmarks.held_out import HELD_OUT
 from figures.parts.records import SceneDict
 from full_geometry.learning.model_errors import LIGHTS, RadianceError, errors_of, transport_of
 from full_geometry.learning.shape_data import draw_object

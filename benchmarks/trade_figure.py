@@ -10,13 +10,13 @@ from tempfile import TemporaryDirectory
 import mitsuba as mi
 import numpy as np
 
+from benchmarks.closed_shapes import write_shape
 from benchmarks.trade_tables import markdown, multiples, trade_table
 from figures.computing.contenders import OF_OBJECTS
 from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training_of, weight_files, with_weights
 from figures.computing.scenes import BUNNY, MM_PER_UNIT, bunny_scene, prepare
 from figures.drawing.page import page
 from figures.drawing.trade_plot import image_shots
-from figures.modelling.closed_shapes import write_shape
 from figures.parts.part import Part, Result, Task
 from figures.parts.records import Params, SceneDict
 from full_geometry.scenes.scene_files import PATH_TRACED

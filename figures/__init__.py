@@ -39,7 +39,7 @@ from importlib.metadata import entry_points
 
 __all__ = ["FIGURES", "figure_modules"]
 
-OF_PAPER = ("fig01", "fig03", "fig05", "fig06", "fig07", "fig08", "fig09", "fig10", "fig11", "fig12", "table1")
+OF_PAPER = ("fig01", "fig05", "fig06", "fig09", "fig10", "fig11", "fig12")
 BEYOND = ("spheres", "thin", "textures", "gathered", "scenes")
 FIGURES = (*OF_PAPER, *BEYOND)
 GROUP = "halfspace_sss.figure_modules"

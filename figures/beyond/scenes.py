@@ -13,7 +13,7 @@ from figures.computing.scenes import prepare
 from figures.computing.things import Staging, lit_scene, shown, thing_parts, walked
 from figures.drawing.image_files import against_walks, image_files, rows_of
 from figures.modelling.head import make_head, write_painted
-from figures.modelling.held_out import HELD_OUT
+from figures.modelling.leaf import LEAVES
 from figures.parts.part import Part, Result, Task, unmodelled
 from figures.parts.records import SceneDict
 from full_geometry.learning.meshes import Box, surface
@@ -97,7 +97,7 @@ def _painted(reflectance: SceneDict, mfp: str) -> SceneDict:
 
 def _leaf(folder: Path, resolution: int) -> SceneDict:
     """A leaf whose colour is an attribute of its vertices."""
-    mesh = make_shape("leaves", LEAF_SEED, resolution, HELD_OUT)
+    mesh = make_shape("leaves", LEAF_SEED, resolution, LEAVES)
     shape = mesh.mitsuba("leaf")
     shape.add_attribute("vertex_colour", 3, leaf_colours(mesh.vertices).astype(np.float32).ravel().tolist())
     path = folder / "leaf.ply"

@@ -11,7 +11,7 @@ from figures.computing.references import NOTE
 from figures.computing.scenes import DRAGON, SCANS
 from figures.computing.things import Staging, lit_scene, shown, thing_parts, walked
 from figures.drawing.image_files import against_walks, image_files, rows_of
-from figures.modelling.held_out import HELD_OUT
+from figures.modelling.leaf import LEAVES
 from figures.parts.part import Part, Result, Task, unmodelled
 from figures.parts.records import SceneDict
 from full_geometry.learning.shapes import TRAINING, make_shape
@@ -86,7 +86,7 @@ def _mesh(thing: Thing, resolution: int, folder: Path) -> Path:
     """The PLY file of a thing."""
     if not thing.family:
         return DRAGON
-    return make_shape(thing.family, thing.seed, resolution, {**TRAINING, **HELD_OUT}).write_ply(folder / "thing.ply")
+    return make_shape(thing.family, thing.seed, resolution, {**TRAINING, **LEAVES}).write_ply(folder / "thing.ply")
 
 
 def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:

@@ -12,12 +12,13 @@ pytest.importorskip("mitsuba")
 pytest.importorskip("torch")
 pytest.importorskip("flip_evaluator")
 
-from figures import fig01, fig06, fig07, fig09, fig11, table1  # noqa: E402
+import benchmarks.__main__  # noqa: E402, F401 - its figures
+from benchmarks.published import distant_light, fig07, table1  # noqa: E402
+from figures import fig01, fig06, fig09, fig11  # noqa: E402
 from figures.computing import learnt, scenes  # noqa: E402
 from figures.computing.contenders import OF_OBJECTS, VOLUMES  # noqa: E402
 from figures.parts import runner  # noqa: E402
 from figures.parts.part import Result, keys_of  # noqa: E402
-from figures.rivals import distant_light  # noqa: E402
 from full_geometry.learning import training  # noqa: E402
 from full_geometry.learning.network_fitting import Recipe  # noqa: E402
 

@@ -12,7 +12,8 @@ import pytest
 
 pytest.importorskip("matplotlib")
 
-from figures import fig03, fig08, fig12  # noqa: E402
+from benchmarks.published import fig03, fig08  # noqa: E402
+from figures import fig12  # noqa: E402
 from figures.computing.learnt import SHAPES  # noqa: E402
 from figures.parts.part import Result, keys_of  # noqa: E402
 from halfspace_sss.neural.store import weights_folder, weights_in  # noqa: E402

@@ -25,7 +25,7 @@ def test_a_head_is_one_closed_surface_with_paint_in_range() -> None:
 
 
 def test_colours_of_a_leaf_vary_and_are_those_of_media() -> None:
-    colours = scenes.leaf_colours(make_shape("leaves", scenes.LEAF_SEED, 24, scenes.HELD_OUT).vertices)
+    colours = scenes.leaf_colours(make_shape("leaves", scenes.LEAF_SEED, 24, scenes.LEAVES).vertices)
     assert colours.min() > 0 and colours.max() < 0.9
     assert np.ptp(colours, axis=0).min() > 0.15
 

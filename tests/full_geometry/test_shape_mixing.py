@@ -13,7 +13,7 @@ dr = pytest.importorskip("drjit")
 mi = pytest.importorskip("mitsuba")
 pytest.importorskip("igl")
 
-from figures.modelling.held_out import HELD_OUT  # noqa: E402
+from benchmarks.held_out import HELD_OUT  # noqa: E402
 from full_geometry.geometry.points import SurfacePoint, cosine_direction  # noqa: E402
 from full_geometry.learning.model_errors import errors_of  # noqa: E402
 from full_geometry.learning.shapes import make_shape  # noqa: E402

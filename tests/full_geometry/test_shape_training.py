@@ -13,8 +13,8 @@ mi = pytest.importorskip("mitsuba")
 pytest.importorskip("igl")
 torch = pytest.importorskip("torch")
 
+from benchmarks.held_out import HELD_OUT  # noqa: E402
 from figures import app as cli  # noqa: E402
-from figures.modelling.held_out import HELD_OUT  # noqa: E402
 from full_geometry.learning import shape_training as training  # noqa: E402
 from full_geometry.learning.shape_data import (  # noqa: E402  # noqa: E402
     GROUPS,

@@ -8,7 +8,7 @@ import pytest
 mi = pytest.importorskip("mitsuba")
 pytest.importorskip("torch")
 
-from figures.rivals import distant_light  # noqa: E402
+from benchmarks.published import distant_light  # noqa: E402
 from full_geometry.objects.objects import TranslucentObject, object_of  # noqa: E402
 from halfspace_sss import Medium  # noqa: E402
 from halfspace_sss.physics.fresnel import F_t  # noqa: E402

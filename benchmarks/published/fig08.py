@@ -86,7 +86,7 @@ def ours(task: Task) -> dict[str, object]:
 
 def papers(task: Task) -> dict[str, object]:
     """Errors of the paper's network for one N, its points from walks and uniform."""
-    from figures.rivals.paper_network import PaperRecipe, estimate, fit_paper
+    from benchmarks.published.paper_network import PaperRecipe, estimate, fit_paper
     from full_geometry.objects.objects import object_of
 
     prepare()

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 import zuko
 
-from figures.rivals.paper_network import placed
+from benchmarks.published.paper_network import placed
 from full_geometry.geometry.mesh import face_vertices, vertex_positions
 from full_geometry.geometry.points import SurfacePoint, channel_mean, cosine_above, place, surface_point
 from full_geometry.objects.objects import TranslucentObject

@@ -16,9 +16,9 @@ pytest.importorskip("igl")
 from coarse import coarse_ball  # noqa: E402
 from waxen import WAX, wax_bunny  # noqa: E402
 
-from figures.rivals import paper_network as paper  # noqa: E402
-from figures.rivals.paper_flow import incidence, irradiance, lit_incidence, mesh_arrays, on_surface, rmsd  # noqa: E402
-from figures.rivals.paper_network import measured_lights, random_lights  # noqa: E402
+from benchmarks.published import paper_network as paper  # noqa: E402
+from benchmarks.published.paper_flow import incidence, irradiance, lit_incidence, mesh_arrays, on_surface, rmsd  # noqa: E402
+from benchmarks.published.paper_network import measured_lights, random_lights  # noqa: E402
 from full_geometry.geometry.points import SurfacePoint  # noqa: E402
 from full_geometry.learning.model_errors import compare, reference  # noqa: E402
 from full_geometry.objects.objects import TranslucentObject, object_of  # noqa: E402

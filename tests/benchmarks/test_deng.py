@@ -11,8 +11,8 @@ mi = pytest.importorskip("mitsuba")
 dr = pytest.importorskip("drjit")
 pytest.importorskip("igl")
 
-from figures.rivals import deng  # noqa: E402
-from figures.rivals.photographs import Poses, Studio, lobe  # noqa: E402
+from benchmarks.published import deng  # noqa: E402
+from benchmarks.published.photographs import Poses, Studio, lobe  # noqa: E402
 from full_geometry.geometry.points import SurfacePoint  # noqa: E402
 from full_geometry.objects.objects import TranslucentObject  # noqa: E402
 from full_geometry.settings import Settings  # noqa: E402

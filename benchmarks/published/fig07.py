@@ -83,8 +83,8 @@ def deng(task: Task) -> dict[str, object]:
     """An object as the fit of Deng et al. has found it from photographs."""
     import mitsuba as mi
 
-    from figures.rivals import deng as study
-    from figures.rivals.photographs import Studio
+    from benchmarks.published import deng as study
+    from benchmarks.published.photographs import Studio
     from full_geometry.scenes.scene_files import load_scene
 
     prepare()
@@ -116,7 +116,7 @@ def distant(task: Task) -> dict[str, object]:
     """An object as the network of TG et al. shows it, before what it mirrors and the rest of the scene."""
     import mitsuba as mi
 
-    from figures.rivals import distant_light as study
+    from benchmarks.published import distant_light as study
     from full_geometry.objects.objects import object_of
     from full_geometry.scenes.scene_files import open_scene
 

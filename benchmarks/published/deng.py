@@ -28,8 +28,8 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
 
+from benchmarks.published.photographs import Studio
 from figures.parts.records import SceneDict
-from figures.rivals.photographs import Studio
 from full_geometry.geometry.mesh import face_vertices, vertex_positions
 from halfspace_sss.progress import Progress
 

@@ -44,7 +44,7 @@ def parts(quality: str) -> list[Part]:
 
 def sampled(task: Task) -> dict[str, object]:
     """Points in the object's frame over its radius, their RMSD to the nearest barycentre, and light where they are."""
-    from figures.rivals.paper_flow import fit_space_flow, mesh_arrays, on_surface, rmsd
+    from benchmarks.published.paper_flow import fit_space_flow, mesh_arrays, on_surface, rmsd
     from full_geometry.learning.training import train_by_cpu
     from full_geometry.objects.objects import object_of
     from full_geometry.transport.storing import frame_of
@@ -89,7 +89,7 @@ def _lit(name: str, task: Task, resolution: int, seed: int) -> mi.Scene:
 
 def _light(obj: TranslucentObject, scene: mi.Scene, frame: ObjectFrame) -> tuple[np.ndarray, np.ndarray]:
     """Random places of the surface, and the light that arrives there."""
-    from figures.rivals.paper_flow import irradiance
+    from benchmarks.published.paper_flow import irradiance
 
     at = obj.random_places(_lanes(PLACES, 43))
     return _positions(frame, at.p), irradiance(at, scene, (44,))
