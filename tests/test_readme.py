@@ -16,7 +16,7 @@ from benchmarks.__main__ import app as studies
 from figures import app as cli
 
 ROOT = Path(__file__).resolve().parent.parent
-LINES, WORDS = 170, 25  # most of README.md, and of a sentence on average
+LINES, WORDS = 150, 25  # most of README.md, and of a sentence on average
 PAGES = ["README.md", *(str(path.relative_to(ROOT)) for path in sorted((ROOT / "docs").glob("*.md")))]
 TEXTS = {page: (ROOT / page).read_text(encoding="utf-8") for page in PAGES}
 BLOCKS = {page: re.findall(r"^```(\w+)\n(.*?)^```", text, flags=re.M | re.S) for page, text in TEXTS.items()}
