@@ -60,23 +60,22 @@ JOBS = ((0.02, 1), (0.05, 1), (0.05, 100), (0.1, 1), (0.2, 1))  # tolerance, ima
 INTRODUCTION = """\
 # Speed against accuracy on scenes
 
-`python -m benchmarks figures all trade` makes this page, the figure, its data (shown by `halfspace-sss trade`) and the
-page to flip between the images. The bunny is 37 mm tall; the spikes, a ball with bumps and thorns, are about as large
-across. The small light stands behind the object: what the camera sees of it was transmitted.
+`python -m benchmarks figures all trade` makes these tables, the figure and the data that `halfspace-sss trade` shows.
+The bunny is 37 mm tall; the spikes, a ball with bumps and thorns, are about as large across. The small light stands
+behind the object: the camera sees transmitted light. Walks have sampled light.
 
 | term | meaning |
 |---|---|
-| bias | relative error of radiance at any number of samples, noise of both sides subtracted, ± standard error |
-| points | root mean square over visible points and channels |
-| fireflies | the brightest of 10⁴ samples; in biases what they carry is spread over the object |
+| bias | relative error of radiance, RMS over visible points and channels, without noise, ± standard error |
 | < x | bias lost in noise, below x in 95 % of cases |
 | cost | variance of a sample times its seconds: the time to a given noise |
+| variance | without the brightest of 10⁴ samples, which filters take better than samples do |
 | seconds | of the processor, all cores together, without compilation |
-| variance | without the brightest of 10⁴ samples, as filters take fireflies better than samples do |
+| – | open: {seconds:g} s for a scene and all techniques were too few |
 
-What cannot be told in {seconds:g} s for a scene and all ways is left open. `full_geometry` learnt the bunny but not
-the spikes, which stand for a new object. Unscattered light is in the walks and not in the half-space models: most of
-their bias of ketchup.
+`full_geometry` learnt the bunny but not the spikes, which stand for a new object. Half-space models lack unscattered
+light: most of their bias of ketchup. Costs of gathered light are above those of renders, which have
+[numbers of low discrepancy](light.md#numbers-of-low-discrepancy).
 """
 KNOBS = """\
 Bunny, small light; cost over that of the usual setting, error where the setting has one.
@@ -115,8 +114,8 @@ def trade_table(scenes: Scenes) -> pandas.DataFrame:
 
 def markdown(scenes: Scenes, seconds: float, settings: Sequence[Mapping[str, object]] = ()) -> str:
     """What is recommended, the bias of every way, and its cost; `seconds` is what each scene had."""
-    lines = [INTRODUCTION.format(seconds=seconds), "## The cheapest way that keeps a tolerance", ""]
-    lines += ["For images of 512 x 512 pixels; in brackets seconds of all cores for all of them, training counted.", ""]
+    lines = [INTRODUCTION.format(seconds=seconds), "## The cheapest technique within a tolerance", ""]
+    lines += ["For images of 512 x 512 pixels; in brackets seconds of all cores for all images, training included.", ""]
     lines.append("| material | shape | light | " + " | ".join(_job(*job) for job in JOBS) + " |")
     lines.append("|---|---|---|" + "---|" * len(JOBS))
     for scene, o in scenes.items():
@@ -125,7 +124,7 @@ def markdown(scenes: Scenes, seconds: float, settings: Sequence[Mapping[str, obj
             option = advise(Assessment((o,), 0.0, 0.0, 0), Job(tolerance, images)).objects[0].options[0]
             told.append(f"{option.way} ({short(option.seconds)})")
         lines.append(f"| {' | '.join(scene)} | {' | '.join(told)} |")
-    lines += ["", "## Bias", "", "Relative error of radiance over visible points, %.", ""]
+    lines += ["", "## Bias", "", "In %.", ""]
     lines += _grid(scenes, lambda w, _: w.told_bias)
     lines += [
         "",

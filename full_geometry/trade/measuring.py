@@ -43,7 +43,7 @@ BLUR_EFFECT = 0.1
 BLUR_SEEN = 0.04  # probability that a direction is in the cone of `sample_blur`
 OWN_SHARE = 0.15  # of the time of a technique, for its cost in the light of the scene; the smoothed light has the rest
 SMOOTHING_PAYS = 2.0  # times the variance by the smoothed environment that walks have by the own one, so that it pays
-SMOOTHING_EFFECT = 0.2  # of a bias², what smoothing may change of it: see docs/choosing.md
+SMOOTHING_EFFECT = 0.2  # of a bias², what smoothing may change of it: see benchmarks/notes/trade_check.md
 FEWEST, POINTS = 64, 5e-3  # of points, and how many times V t
 # Of precomputed light before any measurement: means of images are right to .3 %, points to about 1 %. On a ball of skin
 # under lamp and sky, 1e7 samples gave 4.8e-5 +- 5.4e-5.

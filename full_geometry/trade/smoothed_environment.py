@@ -1,7 +1,8 @@
 """An environment map smoothed over directions, by which few walks tell how wrong a model is.
 
 A walk through a refracting boundary meets a window by chance alone. What S makes of light after two orders and more
-varies little over direction, so that a smoothed map leaves its relative error nearly what it is (docs/choosing.md):
+varies little over direction, so that a smoothed map leaves its relative error nearly the same
+(benchmarks/notes/trade_check.md):
 
     L'(w) = c + g [∫ K(w.w') L(w') dw' - c],  K(x) = κ exp(κ (x - 1)) / (2 pi (1 - exp(-2 κ))),  κ = 1 / WIDTH²,
 
