@@ -6,7 +6,7 @@ import importlib
 import threading
 from typing import TYPE_CHECKING
 
-from full_geometry.scenes.scene_files import plainly
+from full_geometry.scenes.scene_files import apart, plainly
 from full_geometry.settings import VARIANTS, variant_channels
 from halfspace_sss.backend import BackendError, prepare_llvm, two_threads
 
@@ -25,7 +25,8 @@ def register() -> None:
     """Register the plugins with the current variant of Mitsuba, and with every variant that is set later.
 
     What the plugins refuse is from then on the message of the error of `mitsuba.load_dict`, `load_file`, `load_string`
-    and `render`, which without it begins with "unknown plugin" and a traceback.
+    and `render`, which without it begins with "unknown plugin" and a traceback. Without `optimize` the former keep
+    meshes of one translucent surface apart, for `translucent_walk` and models of whole objects.
 
     Raises:
         ValueError: no variant is set, or the plugins do not run under it (scalar or polarised ones).
@@ -41,8 +42,10 @@ def register() -> None:
         _register_all()
         if not _active:
             mi.detail.add_variant_callback(_on_variant)
-            for name in ("load_dict", "load_file", "load_string", "render"):
-                setattr(mi, name, plainly(getattr(mi, name)))
+            for kind in ("dict", "file", "string"):
+                loads = apart(getattr(mi, f"load_{kind}"), getattr(mi.parser, f"parse_{kind}"))
+                setattr(mi, f"load_{kind}", plainly(loads))
+            mi.render = plainly(mi.render)
             _active = True
 
 

@@ -164,6 +164,7 @@ def _turned(n: int, first: np.ndarray, second: np.ndarray, same: np.ndarray, nam
 RAYS = 4096  # of `analyse_shape`
 MOST_HITS = 64  # that one ray counts
 Pointer = "mi.ShapePtr | mi.EmitterPtr | mi.BSDFPtr"  # of Dr.Jit's registry
+HIDDEN = 5e-3  # of hits may be on the wrong side, or rays odd: between faces pass fewer, inside other pieces are more
 MAJORITY = 0.75  # of the first hits from outside agree on the side of the normals, unless the object is a sheet
 
 
@@ -282,8 +283,9 @@ def analyse_shape(shape: mi.Shape, world: mi.Scene | None = None, groups: Iterab
         groups: `instances.Group` of each group that instances in the scene show.
 
     Raises:
-        ValueError: the shape is an instance, whose geometry belongs to several objects; faces of a mesh exist twice; or
-            they point to both sides of a surface that has one side or is not closed.
+        ValueError: the shape is an instance, whose geometry belongs to several objects; faces of a mesh exist twice;
+            closed pieces of it touch or overlap; or faces point to both sides of a surface that has one side or is not
+            closed.
     """
     if is_instance(shape):
         raise ValueError(f"a translucent object must not be an instance, got {shape.id() or shape}")
@@ -298,7 +300,9 @@ def analyse_shape(shape: mi.Shape, world: mi.Scene | None = None, groups: Iterab
         check_copies(faces, name_of(shape))
     votes = _Votes(faces)
     sides, odd = _outside_view(scene, votes)
-    odd = 0.0 if faces is not None and faces.closed else odd  # rays pass between faces by rounding
+    if faces is not None and faces.closed:
+        _check_pieces(shape, max(odd, votes.wrong()))
+        odd = 0.0  # rays pass between faces by rounding
     outward = sides[sides != 0]
     share = float((outward > 0).mean()) if len(outward) else 1.0
     sheet = 1 - MAJORITY < share < MAJORITY and not votes.agree()
@@ -324,6 +328,15 @@ def analyse_shape(shape: mi.Shape, world: mi.Scene | None = None, groups: Iterab
         pieces=votes.pieces, size=size, area=area, state=geometry_of(shape), lost=odd,
         group=next((group for group in groups if any(shape is part for part in group.shapes)), None),
     )  # fmt: skip
+
+
+def _check_pieces(shape: mi.Shape, wrong: float) -> None:
+    """Refuse a closed mesh where a share of the rays leaves what it did not enter: faces of it touch or overlap."""
+    if wrong > HIDDEN:
+        raise ValueError(
+            f"pieces of object {name_of(shape)} must not touch or overlap, got {100 * wrong:.3g} % of the hits of rays "
+            "inside others: join them, or move them apart"
+        )
 
 
 PLACES = (*mesh.GEOMETRY, "to_world", "grid", "control_points", "data", "extent")
@@ -369,6 +382,11 @@ class _Votes:
     def _shares(self) -> np.ndarray:
         hits = np.array(self.hits)
         return np.where(hits > 0, np.array(self.outward) / np.maximum(hits, 1), 1.0)
+
+    def wrong(self) -> float:
+        """Share of the hits that contradict the others on their piece, as those inside another piece do."""
+        hits, outward = np.array(self.hits), np.array(self.outward)
+        return float(np.minimum(outward, hits - outward).sum() / max(hits.sum(), 1))
 
     def agree(self) -> bool:
         """Whether there are pieces, and the hits on each say the same."""
@@ -481,7 +499,7 @@ def name_of(shape: mi.Shape) -> str:
     """The id of a shape in quotes; what it may be, where it has none."""
     if shape.id():
         return repr(shape.id())
-    return "without an id (Mitsuba merges meshes that have the same surface; other shapes get one in the scene)"
+    return "without an id (Mitsuba merges meshes of one surface; load_dict(..., optimize=False) keeps them apart)"
 
 
 def _by_optix() -> bool:

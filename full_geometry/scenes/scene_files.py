@@ -98,6 +98,7 @@ def _is_ours(error: BaseException) -> bool:
     return _TRACEBACK in text and "ValueError: " in text and _HERE in text[text.rindex(_TRACEBACK) :]
 
 
+NO_MESHES = ("sphere", "disk", "cylinder", "sdfgrid", "bsplinecurve", "linearcurve", "instance", "shapegroup")
 _INTEGRATORS = {False: "bssrdf", True: "translucent_walk"}
 _NO_OBJECT = "the scene must have an object with a translucent BSDF, got none"
 
@@ -154,12 +155,8 @@ def open_scene(
     known = WALK_LIGHTS if walks else LIGHTS if model else tuple(dict.fromkeys((*LIGHTS, *WALK_LIGHTS)))
     _check("light", light, known)
     state, config = _parsed(scene, parameters or {})
-    # a model that knows whole objects does not know what Mitsuba makes of several with the same BSDF
     names = [str(props.get("model", "")) for props in _surfaces(state)]
-    config.merge_meshes = not any(
-        name in model_names() and of_objects(name) for name in (*names, "" if walks else model)
-    )
-    _transform(scene, state, config)
+    _transform(scene, state, config, apart=walks or _apart(state, model))
     for props in _surfaces(state):  # anew: the nodes have moved
         if model and not walks:
             props["model"] = model
@@ -202,8 +199,7 @@ def load_objects(scene: dict | str | Path, parameters: Mapping[str, str] | None 
     """
     state, config = _parsed(scene, parameters or {})
     _surfaces(state)
-    config.merge_meshes = False
-    _transform(scene, state, config)
+    _transform(scene, state, config, apart=True)
     return _made(scene, state, config)
 
 
@@ -252,11 +248,78 @@ def _parsed(scene: dict | str | Path, parameters: Mapping[str, str]) -> tuple[An
     return state, config
 
 
-def _transform(scene: dict | str | Path, state: Any, config: Any) -> None:
+def _transform(scene: dict | str | Path, state: Any, config: Any, apart: bool) -> None:
+    """Resolve what a scene says; meshes of one translucent surface stay `apart`, or become one, as others do."""
+    config.merge_meshes = False
     try:
         mi.parser.transform_all(config, state)
+        if not (apart and _shares_surface(state)):
+            config.merge_meshes = True
+            mi.parser.transform_merge_meshes(config, state)
     except RuntimeError as error:
         raise _unreadable(scene, error) from error
+
+
+def _apart(state: Any, model: str | None = None) -> bool:
+    """Whether what renders a scene knows whole objects, and not what Mitsuba makes of several with the same surface."""
+    known = [name for name in (model, *(str(props.get("model", "")) for props in _surfaces(state))) if name]
+    walks = model is None and any(node.props.plugin_name() == _INTEGRATORS[True] for node in state.nodes)
+    return walks or any(name in model_names() and of_objects(name) for name in known)
+
+
+def _shares_surface(state: Any) -> bool:
+    """Whether two meshes have the same translucent surface, which Mitsuba would merge."""
+    found = []
+    for node in state.nodes:
+        if node.type == mi.ObjectType.Shape and node.props.plugin_name() not in NO_MESHES:
+            found += [index for index in _references(node.props) if _is_translucent(state, index)]
+    return len(set(found)) < len(found)
+
+
+def _references(props: Any) -> list[int]:
+    """Numbers of the nodes that a node refers to."""
+    values = [props[key] for key in props.keys()]
+    return [value.index() for value in values if isinstance(value, mi.Properties.ResolvedReference)]
+
+
+def _is_translucent(state: Any, index: int) -> bool:
+    """Whether a node is a translucent surface, or something around one."""
+    props = state.nodes[index].props
+    return props.plugin_name() == "translucent" or any(_is_translucent(state, k) for k in _references(props))
+
+
+def apart(function: Callable, parse: Callable) -> Callable:
+    """A function of Mitsuba that loads scenes, which keeps meshes apart where what renders them knows whole objects.
+
+    Args:
+        function: `mitsuba.load_dict`, `load_file` or `load_string`.
+        parse: the function of `mitsuba.parser` for what that takes.
+    """
+
+    @functools.wraps(function)
+    def found(scene: Any, *args: Any, **more: Any) -> Any:
+        if not args and "optimize" not in more and _asks_apart(parse, scene, more):
+            more["optimize"] = False
+        return function(scene, *args, **more)
+
+    return found
+
+
+def _asks_apart(parse: Callable, scene: Any, more: Mapping[str, Any]) -> bool:
+    """Whether meshes of a scene have to stay apart; what cannot be read is left to who loads it."""
+    if isinstance(scene, dict) and scene.get("type") != "scene":
+        return False
+    config = mi.parser.ParserConfig(mi.variant())
+    config.merge_meshes = False
+    config.unused_parameters = config.unused_properties = mi.LogLevel.Debug
+    try:
+        state = parse(config, scene, **{key: value for key, value in more.items() if key != "parallel"})
+        if not any(node.props.plugin_name() == "translucent" for node in state.nodes) or not _apart(state):
+            return False
+        mi.parser.transform_all(config, state)
+    except (RuntimeError, TypeError):
+        return False
+    return _shares_surface(state)
 
 
 def _unreadable(scene: dict | str | Path, error: RuntimeError) -> ValueError:

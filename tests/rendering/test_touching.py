@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 import pytest
+
+from full_geometry.geometry.shape import analyse_shape
+from full_geometry.scenes.scene_files import open_scene
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -49,6 +53,48 @@ def test_two_blocks_beside_each_other_are_white_in_a_furnace(gap: float, eta: fl
 def test_blocks_that_touch_or_overlap_are_refused_by_name(integrator: str, gap: float) -> None:
     with pytest.raises(ValueError, match="got the shape '(one|two)' .*object '(one|two)'"):
         _rendered(_two_blocks(gap, integrator))
+
+
+@pytest.mark.parametrize("gap", [1e-6, 0.0, -1e-6, -1e-4, -3e-3, -0.5])
+def test_pieces_of_one_mesh_that_touch_or_overlap_are_refused(gap: float) -> None:
+    """Merged by Mitsuba: a furnace of them was 1.10 to 1.21."""
+    blocks = {
+        "one": _box((-2, -1, -1), (-gap / 2, 1, 1), bsdf=_wax(1.0, 1.4)),
+        "two": _box((gap / 2, -1, -1), (2, 1, 1), bsdf=_wax(1.0, 1.4)),
+    }
+    (merged,) = mi.load_dict({"type": "scene", **blocks}).shapes()
+    with pytest.raises(ValueError, match="pieces of object .* must not touch or overlap, got .* of the hits of rays"):
+        analyse_shape(merged)
+
+
+def test_pieces_of_one_mesh_that_are_apart_or_inside_each_other_are_not_refused() -> None:
+    inner = _box((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5), bsdf=_wax(1.0, 1.4))
+    outer = _box((-1, -1, -1), (1, 1, 1), bsdf=_wax(1.0, 1.4))
+    beside = _box((1 + 1e-4, -1, -1), (2, 1, 1), bsdf=_wax(1.0, 1.4))
+    (merged,) = mi.load_dict({"type": "scene", "outer": outer, "beside": beside}).shapes()
+    assert analyse_shape(merged).closed
+    (hollow,) = mi.load_dict({"type": "scene", "outer": outer, "inner": inner}).shapes()
+    assert analyse_shape(hollow).closed
+
+
+@pytest.mark.parametrize(
+    ("integrator", "model", "apart"),
+    [("translucent_walk", "better_dipole", 2), ("bssrdf", "neural_shape", 2), ("bssrdf", "better_dipole", 1)],
+)
+def test_meshes_of_one_surface_stay_apart_for_what_knows_whole_objects(
+    integrator: str, model: str, apart: int, tmp_path: Path
+) -> None:
+    """By every way to load a scene; models of half-spaces tell pieces apart by themselves."""
+    text = f"""<scene version="3.0.0"><integrator type="{integrator}"/>
+      <bsdf type="translucent" id="wax"><string name="model" value="{model}"/><float name="sigma_t" value="20"/>
+        <float name="albedo" value=".9"/></bsdf>
+      <shape type="cube"><ref id="wax"/></shape>
+      <shape type="cube"><ref id="wax"/><transform name="to_world"><translate x="4"/></transform></shape></scene>"""
+    path = tmp_path / "two.xml"
+    path.write_text(text)
+    scenes = mi.load_string(text), mi.load_file(str(path)), open_scene(path)
+    assert [len(scene.shapes()) for scene in scenes] == 3 * [apart]
+    assert len(mi.load_string(text, optimize=True).shapes()) == 1
 
 
 def test_glass_on_the_surface_of_an_object_is_refused_by_name() -> None:
