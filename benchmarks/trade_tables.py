@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from figures.drawing.trade_plot import LEAST, NOISE, pareto, span_in_mfp, time_to_noise
+from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.trade.advice import advise
 from full_geometry.trade.job import Job
 from full_geometry.trade.results import Assessment, ObjectTrade, TechniqueTrade
@@ -130,7 +131,7 @@ def markdown(scenes: Scenes, seconds: float, settings: Sequence[Mapping[str, obj
         "",
         "## Cost",
         "",
-        "Variance of a sample times seconds of a million samples, over that of path tracing.",
+        "Variance of a sample times seconds of a million samples, over path tracing's.",
         "",
     ]
     lines += _grid(scenes, lambda w, o: f"{w.variance * w.seconds / (o.traced.variance * o.traced.seconds):.2g}")
@@ -149,16 +150,14 @@ def _job(tolerance: float, images: int) -> str:
 
 
 def _grid(scenes: Scenes, cell: Callable[[TechniqueTrade, ObjectTrade], str]) -> list[str]:
-    """A row for each way, a column for each scene of a material, a table for each material."""
-    lines: list[str] = []
+    """A row for each technique but walks, of each material; a column for each shape and light."""
+    columns = list(dict.fromkeys(key[1:] for key in scenes))
+    lines = ["| | " + " | ".join(map(", ".join, columns)) + " |", "|---|" + "---:|" * len(columns)]
     for material in dict.fromkeys(key[0] for key in scenes):
-        mine = {key: o for key, o in scenes.items() if key[0] == material}
-        lines.append(f"| {material} | " + " | ".join(f"{shape}, {light}" for _, shape, light in mine) + " |")
-        lines.append("|---|" + "---:|" * len(mine))
-        names = dict.fromkeys(w.way for o in mine.values() for w in o.ways if not w.refusal)
+        mine = [scenes.get((material, *column)) for column in columns]
+        names = dict.fromkeys(w.way for o in mine if o for w in o.ways if not w.refusal and w.way != PATH_TRACED)
         for name in names:
-            rows = [next((w for w in o.ways if w.way == name and not w.refusal), None) for o in mine.values()]
-            cells = ["–" if w is None else cell(w, o) for w, o in zip(rows, mine.values())]
-            lines.append(f"| {name} | {' | '.join(cells)} |")
-        lines.append("")
-    return lines[:-1]
+            rows = [next((w for w in o.ways if w.way == name and not w.refusal), None) if o else None for o in mine]
+            cells = ["–" if w is None or o is None else cell(w, o) for w, o in zip(rows, mine)]
+            lines.append(f"| {material}: {name} | {' | '.join(cells)} |")
+    return lines
