@@ -44,7 +44,7 @@ class Settings:
     """
 
     mm_per_unit: float = 1.0
-    max_depth: int = 8
+    max_depth: int = -1
     rr_depth: int = 5
     geometry: str = "distance"
     area_share: float = AUTOMATIC

@@ -88,6 +88,7 @@ def splat(
     block = film.create_block()
     block.set_coalesce(block.coalesce() and spp >= 4)
     alpha = dr.select(seen, mi.Float(1), mi.Float(0))
+    dr.eval(L, alpha, position, rays.wavelengths, layers)  # what follows has the crop of the film in its kernel
     has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
         values = film.prepare_sample(L, rays.wavelengths, block.channel_count(), weight=1.0, alpha=alpha)

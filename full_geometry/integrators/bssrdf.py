@@ -135,6 +135,7 @@ def _class(variant: str) -> type:
             # camera rays, L of each, and its weight by the reconstruction filter
             sampler = launch.sampler(sensor, seed)
             ray, weight, position = rays_by(sensor, sampler)
+            dr.eval(ray, weight, position)  # the crop is in their kernel alone
             L, hit, _ = self.sample(scene, sampler, ray)
             splat(sensor.film(), ray, L * weight, hit, position, launch.spp)
 

@@ -209,7 +209,7 @@ def _settings(scene: mi.Scene) -> tuple[dict[str, Any], dict[str, Any]]:
     integrator = scene.integrator()
     if is_bssrdf(integrator):
         return integrator.settings.shared(), integrator.settings.of_models()
-    common: dict[str, Any] = {"mm_per_unit": millimetres(scene), "hide_emitters": False, "max_depth": 8, "rr_depth": 5}
+    common: dict[str, Any] = {"mm_per_unit": millimetres(scene), "hide_emitters": False, "max_depth": -1, "rr_depth": 5}
     if isinstance(integrator, KnowsUnit):  # `translucent_walk`
         common |= {"hide_emitters": integrator.hidden}
     return common, {}

@@ -23,11 +23,12 @@ def _variant():
     gc.collect()
 
 
-def loaded(material: str, model: str, mm_per_unit: float = 3.0):
+def loaded(material: str, model: str, mm_per_unit: float = 3.0, crop: tuple[int, ...] = (0, 0, 4, 4)):
     from full_geometry.scenes.scene_files import load_scene
 
     view = mi.ScalarTransform4f().look_at([3, 4, 9], [0, 0, 0], [0, 1, 0])
-    film = {"type": "hdrfilm", "width": 4, "height": 4}
+    film = {"type": "hdrfilm", "width": 12, "height": 12}
+    film |= dict(zip(("crop_offset_x", "crop_offset_y", "crop_width", "crop_height"), crop))
     description = {
         "type": "scene", "integrator": {"type": "bssrdf", "mm_per_unit": mm_per_unit}, "light": {"type": "constant"},
         "object": {"type": "cube", "bsdf": {"type": "translucent", "material": material}},
@@ -58,6 +59,15 @@ def test_a_kernel_serves_other_materials_units_and_numbers_of_samples(model):
     for material, mm_per_unit, spp in (("potato", 3.0, 5), ("marble", 3.0, 5), ("apple", 6.0, 7)):
         gc.collect()
         kernels.add(largest_kernel(loaded(material, model, mm_per_unit), spp))
+    assert len(kernels) == 1
+
+
+@pytest.mark.parametrize("model", ["better_dipole", "path_traced"])
+def test_a_kernel_serves_other_crops_of_a_film(model):
+    kernels = set()
+    for crop in ((1, 2, 4, 4), (2, 3, 5, 3), (3, 1, 7, 9)):
+        gc.collect()
+        kernels.add(largest_kernel(loaded("potato", model, crop=crop), 5))
     assert len(kernels) == 1
 
 

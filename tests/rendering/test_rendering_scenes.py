@@ -35,6 +35,22 @@ def view(shape: dict, emitter: dict | None = None, distance: float = 30.0, n: in
     }  # fmt: skip
 
 
+def test_paths_have_no_limit_unless_one_is_set() -> None:
+    """Of a white ball in a glass case eight vertices lose light."""
+    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    view = mi.ScalarTransform4f().look_at([0, 0, 8], [0, 0, 0], [0, 1, 0])
+    white = {"type": "translucent", "sigma_t": 200.0, "albedo": 1.0, "eta": 1.3, "model": "lambert"}
+    scene = {
+        "type": "scene", "sky": {"type": "constant"},
+        "sensor": {"type": "perspective", "fov": 14, "to_world": view, "film": film},
+        "case": {"type": "sphere", "radius": 1.5, "bsdf": {"type": "dielectric"}},
+        "ball": {"type": "sphere", "bsdf": white},
+    }  # fmt: skip
+    depths = ({}, {"max_depth": -1}, {"max_depth": 8})
+    unset, unlimited, eight = (render(scene | {"integrator": {"type": "bssrdf", **depth}}, 2**9) for depth in depths)
+    assert (unset == unlimited).all() and unset.mean() > eight.mean() + 0.01
+
+
 def quietly(scene: dict, spp: int = 4) -> np.ndarray:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
