@@ -16,7 +16,6 @@ from benchmarks.__main__ import app as studies
 from figures import app as cli
 
 ROOT = Path(__file__).resolve().parent.parent
-LINES, WORDS = 150, 25  # most of README.md, and of a sentence on average
 PAGES = ["README.md", *(str(path.relative_to(ROOT)) for path in sorted((ROOT / "docs").glob("*.md")))]
 TEXTS = {page: (ROOT / page).read_text(encoding="utf-8") for page in PAGES}
 BLOCKS = {page: re.findall(r"^```(\w+)\n(.*?)^```", text, flags=re.M | re.S) for page, text in TEXTS.items()}
@@ -85,20 +84,6 @@ def test_links_to_files_and_headings_hold() -> None:
                 titles = re.findall(r"^#+ (.*)$", file.read_text(encoding="utf-8"), flags=re.M)
                 slugs = [re.sub(r"[\s-]+", "-", re.sub(r"[^\w\s-]", "", title).strip().lower()) for title in titles]
                 assert heading in slugs, (page, target, heading)
-
-
-def test_the_guide_is_short_to_read() -> None:
-    assert len(TEXTS["README.md"].splitlines()) <= LINES
-    for page, text in TEXTS.items():
-        lengths = [len(sentence.split()) for sentence in _sentences(text)]
-        assert sum(lengths) <= WORDS * len(lengths), page
-
-
-def _sentences(text: str) -> list[str]:
-    """Sentences of the paragraphs and list items of a page, without code, tables, pictures and headings."""
-    prose = re.sub(r"^```.*?^```", "", text, flags=re.M | re.S)
-    prose = re.sub(r"^(?:\||#|!| {4}[^ -]).*$", "", prose, flags=re.M)
-    return [part for part in re.split(r"(?<=[.!?])\s+|\n\s*\n|\n\s*[-*] ", prose) if part.strip()]
 
 
 def test_the_check_installs_and_tests_as_the_readme_says() -> None:
