@@ -334,12 +334,12 @@ def caption(budgets: Sequence[Budget], threads: int) -> str:
     """What the table of trainings on so many threads says, and what it does not."""
     within = ", or ".join(map(str, budgets))
     return (
-        f"Each row changes one thing against the row above it. All are trained on the same maps, for {within} each, on "
+        f"Each row changes one thing in the row above it. All are trained on the same maps, for {within} each, on "
         f"{threads} thread(s), and asked for unseen pairs of directions. samples: cells seen, two points of each; "
         f"error, bias: energy-weighted, order >= 2, blocks of {BLOCK} x {BLOCK} cells, noise removed, up to 12 L; ± is "
         "the standard deviation over seeds; r: the error by decades of distance, mean free paths. The first row is the "
         "paper's set-up (inputs, size, loss) at this budget, with our maps, optimiser and rate: the authors trained "
-        "2118 s on an RTX 4090, so it is not their converged error and says nothing against their figures. What the "
-        "table says is how much each change brings where training is short. The training of the universal network, "
-        "done once for all media, is not counted."
+        "2118 s on an RTX 4090, so it is not their converged error and says nothing against their figures. The "
+        "table shows the gain of each change where training is short. The training of the universal network, done once "
+        "for all media, is not counted."
     )

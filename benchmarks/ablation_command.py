@@ -34,20 +34,23 @@ def ablation_command(
         str | None, typer.Option(help="Its channel, by name or number.", show_default="the first")
     ] = None,
     seconds: Annotated[
-        float | None, typer.Option(help="Equal time: of each training.", show_default="20, none with --samples")
+        float | None,
+        typer.Option(help="Seconds of each training at equal time.", show_default="20, none with --samples"),
     ] = None,
     samples: Annotated[
         int | None,
-        typer.Option(help="Equal data: of each training.", parser=whole, show_default="1000000, none with --seconds"),
+        typer.Option(
+            help="Samples of each training at equal data.", parser=whole, show_default="1000000, none with --seconds"
+        ),
     ] = None,
     seeds: Annotated[int, typer.Option(help="Trainings of each variant.", parser=whole)] = 3,
     seed: Annotated[int, typer.Option(help="Seed of the maps, and the first of the trainings.", parser=whole)] = 0,
     backend: Backend = "llvm",
     out: OutFolder = Path("ablation"),
 ) -> None:
-    """Train the paper's network, `neural_material` and what lies between them, at equal time and at equal data.
+    """Train the paper's network, `neural_material` and the steps between them, at equal time and at equal data.
 
-    48 trainings by default, about 20 min; one that was ended goes on after the trainings that it has finished.
+    48 trainings by default, about 20 min; an interrupted run goes on after its finished trainings.
     """
     if find_spec("torch") is None:
         raise ValueError("training needs torch: `pip install halfspace-sss[train]`")

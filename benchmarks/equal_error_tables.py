@@ -20,14 +20,14 @@ WANTED = 0.02  # noise of an image, root mean square over that of the image, at 
 CERTAIN = 2.0  # standard errors by which an error must stand out of the noise of the truth
 NOTES = """\
 Cost is the mean squared error of the pixels of the object times CPU seconds, without compilation. A ratio is the cost
-of `volpathmis`, at the best of its settings, over that of the method: how many times less time the method needs for
-equal error.
+of `volpathmis`, at the best of its settings, over the method's cost: the time of `volpathmis` over the time of the
+method for equal error.
 
 | column | meaning |
 |---|---|
 | variance | ratio with the error about a long independent render by the same method |
 | with bias | ratio with the error about the path traced image at this number of samples; bias makes it fall with time |
-| bias | root mean square of the error after infinite time, over that of the image |
+| bias | root mean square of the error after infinite time, over the image's |
 | until | CPU seconds after which `volpathmis` is as near to the truth as that bias |
 | training | of `full_geometry`, not counted in the ratios |
 | paid after | images of 2 % noise after which the training has paid |
@@ -138,7 +138,7 @@ def markdown(errors: pandas.DataFrame, sampling: pandas.DataFrame, furnace: pand
         in_markdown(steps),
     ]
     names = [label(name) if name == WALK else look(name).label for name in furnace["method"]]
-    parts += ["## White furnace", "Mean radiance, 1 for what neither absorbs nor gains.", _furnace(furnace, names)]
+    parts += ["## White furnace", "Mean radiance; 1 is right.", _furnace(furnace, names)]
     return "\n\n".join(parts) + "\n"
 
 

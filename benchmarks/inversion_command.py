@@ -35,9 +35,11 @@ def inversion_command(
         int, typer.Option(help="Samples a pixel of each render of a step; textures take a quarter.", parser=whole)
     ] = 64,
     target_spp: Annotated[int, typer.Option(help="Samples a pixel of given images of media.", parser=whole)] = 2048,
-    steps: Annotated[int, typer.Option(help="Of `fit`, of media; textures take twice as many.", parser=whole)] = 30,
-    prb_steps: Annotated[int, typer.Option(help="Of `prbvolpath`; 0 leaves it out.", parser=whole)] = 200,
-    seed: Annotated[int, typer.Option(help="Seed of everything.", parser=whole)] = 0,
+    steps: Annotated[
+        int, typer.Option(help="Steps of `fit` for media; textures take twice as many.", parser=whole)
+    ] = 30,
+    prb_steps: Annotated[int, typer.Option(help="Steps of `prbvolpath`; 0 leaves it out.", parser=whole)] = 200,
+    seed: Annotated[int, typer.Option(help="Seed of random numbers.", parser=whole)] = 0,
     out: OutFolder = Path("inversion"),
 ) -> None:
     """Measure fits of media beside `prbvolpath`, of textures beside a dipole, and gradients of both.

@@ -29,10 +29,10 @@ def rivals_command(
         list[str] | None, typer.Option(help="errors, samplers or base_models; repeat for several.", show_default="all")
     ] = None,
     seconds: Annotated[
-        float, typer.Option(help="CPU time of each training, data included; of base models of the longest.")
+        float, typer.Option(help="CPU time of each training with its data; for base_models, of the longest.")
     ] = 60.0,
-    samples: Annotated[int, typer.Option(help="Of each exit, for errors and variances.", parser=whole)] = 2048,
-    seed: Annotated[int, typer.Option(help="Seed of everything.", parser=whole)] = 0,
+    samples: Annotated[int, typer.Option(help="Samples of each exit, for errors and variances.", parser=whole)] = 2048,
+    seed: Annotated[int, typer.Option(help="Seed of random numbers.", parser=whole)] = 0,
     define: Define = None,
     variant: Variant = "llvm_ad_rgb",
     out: OutFolder = Path("rivals"),

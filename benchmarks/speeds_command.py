@@ -45,7 +45,7 @@ def speeds_command(
         list[str] | None,
         typer.Option(help="sampled or gathered; repeat for more.", show_default="both"),
     ] = None,
-    over: Annotated[str, typer.Option(help="What counts as one: volpathmis or translucent_walk.")] = "volpathmis",
+    over: Annotated[str, typer.Option(help="Technique of speed 1: volpathmis or translucent_walk.")] = "volpathmis",
     passes: Annotated[int, typer.Option(help="Passes of 16 samples a pixel.", parser=whole)] = 6,
     frames: Annotated[bool, typer.Option(help="Time the next frames of gathered light too.")] = True,
     size: Annotated[int, typer.Option(help="Pixels of the square images.", parser=whole)] = 96,
@@ -95,7 +95,7 @@ def speeds_command(
 
 def gathered_command(
     objects: Annotated[
-        list[str] | None, typer.Option("--object", help="As of `speeds`.", show_default="bunny of potato")
+        list[str] | None, typer.Option("--object", help="Object, as in `speeds`.", show_default="bunny of potato")
     ] = None,
     model: Annotated[
         list[str] | None,
@@ -110,14 +110,14 @@ def gathered_command(
     ] = None,
     samples: Annotated[
         int,
-        typer.Option(help="Of a pixel, sampled and walked; an eighth of them gathered.", parser=whole),
+        typer.Option(help="Samples a pixel of sampled light and walks; gathered light takes an eighth.", parser=whole),
     ] = 2048,
     size: Annotated[int, typer.Option(help="Pixels of the square images.", parser=whole)] = 64,
     seconds: Annotated[float, typer.Option(help="CPU time of each training of full_geometry.")] = 24.0,
     seed: Annotated[int, typer.Option(help="Seed of all renders.", parser=whole)] = 0,
     out: OutFolder = Path("gathered"),
 ) -> None:
-    """Measure what gathered light adds to the error of models, and how far both are off walks: all orders."""
+    """Measure the error that gathered light adds to models, and the errors of both against walks, all orders."""
     use_mitsuba("llvm_ad_rgb")
     from benchmarks.gathered_error import Comparing, gathered_errors, shown
     from benchmarks.speeds import LIGHTS, MODELS, OTHER_LIGHTS, LitObject

@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 def check_command(
     places: Places,
-    scenes: Annotated[int, typer.Option(help="How many.", parser=whole)] = 60,
-    first: Annotated[int, typer.Option(help="Number of the first one.", parser=whole)] = 0,
+    scenes: Annotated[int, typer.Option(help="Number of scenes.", parser=whole)] = 60,
+    first: Annotated[int, typer.Option(help="Number of the first scene.", parser=whole)] = 0,
     seed: Annotated[int, typer.Option(help="Other seeds draw other scenes.", parser=whole)] = 0,
-    tolerance: Annotated[float | None, typer.Option(help="Of all scenes; drawn for each if not given.")] = None,
+    tolerance: Annotated[float | None, typer.Option(help="Tolerance of all scenes; by default drawn for each.")] = None,
     assess: Annotated[float, typer.Option(help="Seconds of measuring for a recommendation.")] = 4.0,
     truth: Annotated[float, typer.Option(help="Most seconds of the long runs, with seeds of their own.")] = 24.0,
     write_only: Annotated[bool, typer.Option("--write-only", help="Write the scenes, measure nothing.")] = False,
@@ -31,7 +31,7 @@ def check_command(
         "trade-check"
     ),
 ) -> None:
-    """Draw scenes (shape x medium x light x size x tolerance) and see whether recommendations keep what they say."""
+    """Draw scenes (shape x medium x light x size x tolerance) and check recommendations against long runs."""
     check_count("scenes", scenes, 1)
     check_count("first", first, 0)
     check_count("seed", seed, 0)

@@ -71,7 +71,7 @@ def _always(table: pandas.DataFrame, name: str) -> JsonDict:
 
 
 INTRODUCTION = """\
-# What the advice of the trade is worth
+# The advice of `trade` on random scenes
 
 Written by `python -m benchmarks trade-check` ({arguments}): random scenes of shape x medium x light x size x tolerance.
 Each object is learnt for {train:g} s before. Each scene has {assess:g} s for a recommendation among {ways} ways, and up

@@ -79,7 +79,7 @@ light: most of their bias of ketchup. Costs of gathered light are above those of
 [numbers of low discrepancy](light.md#numbers-of-low-discrepancy).
 """
 KNOBS = """\
-Bunny, small light; cost over that of the usual setting, error where the setting has one.
+Bunny, small light; cost over the usual setting's, error where the setting has one.
 
 | knob | meaning |
 |---|---|

@@ -48,7 +48,7 @@ GROUPS: Mapping[str, tuple[str, Mapping[str, Callable]]] = {
         "Measure how wrong models are.",
         {"materials": errors_materials, "object": errors_object, "truths": errors_truths},
     ),
-    "figures": ("Compute what changed of the paper's figures, and draw them.", FIGURES),
+    "figures": ("Compute changed parts of the paper's figures, and draw them.", FIGURES),
 }
 SINGLE = {
     "bench": bench, "curves": curves, "fit": fit, "maps": maps, "models": models,

@@ -37,7 +37,7 @@ RESOLUTION = {"draft": 64, "paper": 240}  # of surfaces; grids have half of it
 LIGHT = "sunset"  # the small lamps of the studio are hardly found by walks
 NOTES = (
     "The candle is homogeneous wax with its flame as a small emitter in the bowl; mandarin and croissant are grid "
-    "volumes, of which the half-space takes the means. Smooth boundaries, all scattering orders; models by their "
+    "volumes, whose means the half-space takes. Smooth boundaries, all scattering orders; models render by "
     f"gathered light. FLIP and relative squared error of the pixels of the object. {NOTE}"
 )
 

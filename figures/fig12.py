@@ -30,8 +30,8 @@ SHOWN = {"draft": ("small light",), "paper": tuple(LIGHTS)}
 SAMPLERS = ("probes", "patches")
 ENTRIES = (1, 8)  # points of entry of an exit
 NOTES = (
-    "The same network in all images, one path a pixel; what differs is where points of entry are drawn: probes that "
-    "follow the half-space, or learnt weights of patches. Of N entries of an exit one is followed. Gathered "
+    "The same network in all images, one path a pixel; the images differ in how points of entry are drawn: probes that "
+    "follow the half-space, or learnt weights of patches. One of N entries of an exit is followed. Gathered "
     "light takes the sum over entries. FLIP and relative squared error against many samples by patches, denoised by "
     "Open Image Denoise; FLIP below these is between two halves of them."
 )

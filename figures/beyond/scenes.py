@@ -39,9 +39,9 @@ STAGES = {
 }
 NOTES = (
     "All images contain all scattering orders. The head's reflectance is a bitmap by uv, the leaf's an attribute of "
-    "vertices: the walk takes the medium of its exit for the whole way, half-space models that of both ends, and "
+    "vertices: the walk takes the medium of its exit for the whole way, half-space models take both ends, and "
     "full_geometry learnt it from walks. The stone in the jelly is opaque: half-space models refuse it, "
-    "full_geometry learnt jelly and stone. Models by their gathered light. FLIP and relative squared error of the "
+    "full_geometry learnt jelly and stone. Models render by gathered light. FLIP and relative squared error of the "
     f"pixels of the object. {NOTE}"
 )
 

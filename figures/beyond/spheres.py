@@ -17,7 +17,7 @@ from figures.parts.records import Params, SceneDict
 from halfspace_sss.comparison.style import COLUMN, look, paper, saved
 from halfspace_sss.physics.medium import Medium
 
-TITLE = "bias of the half-space on spheres of decreasing radius, and what `neural_shape` leaves of it"
+TITLE = "bias of the half-space and of `neural_shape` on spheres of decreasing radius"
 MODELS = (*contenders.MODELS, "neural_shape")
 RADII = (1.0, 3.0, 10.0, 30.0, 100.0)  # mean free paths
 MEDIUM = {"albedo": 0.95, "g": 0.0, "eta": 1.3}

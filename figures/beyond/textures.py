@@ -33,9 +33,9 @@ BANDS = ((0.80, 0.72, 0.60), (0.62, 0.36, 0.20), (0.84, 0.80, 0.70), (0.70, 0.50
 SPOT = (0.68, 0.20, 0.10)
 STAGE = Staging((0.25, 0.15, 1), (-0.9, 0.8, 0.7), fov=23.0, lamp_radius=0.4, sky=0.25)
 NOTES = (
-    "All images contain all scattering orders. The walk takes the medium of its exit for the whole way, models that of "
+    "All images contain all scattering orders. The walk takes the medium of its exit for the whole way, models take "
     "both ends. The bunny's reflectance is an attribute of its vertices, the ball's reflectance and mean free "
-    "path are bitmaps. Models by their gathered light. FLIP and relative squared error of the pixels of the object. "
+    "path are bitmaps. Models render by gathered light. FLIP and relative squared error of the pixels of the object. "
     f"{NOTE}"
 )
 

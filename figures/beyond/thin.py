@@ -26,8 +26,8 @@ MODEL_SPP = {"draft": 16, "paper": 64}
 TRUTH_SPP = {"draft": 128, "paper": 1024}
 NOTES = (
     "All images contain all scattering orders: the models lack the orders below two, which are path traced beside "
-    "them, but for what passes a half-space unscattered. The leaf is of a family of shapes that `neural_shape` was not "
-    "trained on; the dragon was among its meshes, and shells, but not this one, among its families. Models by their "
+    "them, except light that passes unscattered. The leaf is of a family of shapes that `neural_shape` was not "
+    "trained on; the dragon was among its meshes, and shells, but not this one, among its families. Models render by "
     f"gathered light. FLIP and relative squared error of the pixels of the object. {NOTE}"
 )
 

@@ -82,7 +82,7 @@ Variant = Annotated[Literal["llvm_ad_rgb", "cuda_ad_rgb"], typer.Option(help="Va
 
 
 def compute(chosen: FigureOptions, places: Places, variant: Variant = "llvm_ad_rgb") -> None:
-    """Compute parts of figures; one that is there is computed again only if what it depends on changed."""
+    """Compute parts of figures; a finished part is computed again only if its inputs changed."""
     with _libraries():
         for _ in _completed(chosen, places, variant):
             pass

@@ -20,12 +20,14 @@ if TYPE_CHECKING:
 class DescentOptions:
     """How images are compared, and the steps."""
 
-    steps: Annotated[int, typer.Option(help="How many.", parser=shared.whole, show_default="30; 60: textures")] = 0
+    steps: Annotated[
+        int, typer.Option(help="Number of steps.", parser=shared.whole, show_default="30; 60: textures")
+    ] = 0
     spp: Annotated[int, typer.Option(help="Samples a pixel of each render of a step.", parser=shared.whole)] = 64
     batch: Annotated[int, typer.Option(help="Views a step.", parser=shared.whole, show_default="4, or all")] = 0
-    loss: Annotated[Literal["relative", "l2", "robust"], typer.Option(help="Of the pixels.")] = "relative"
-    exposure: Annotated[bool, typer.Option("--exposure", help="Each image has an unknown factor.")] = False
-    tv: Annotated[float, typer.Option(help="Of textures: weight of their total variation.")] = 0.02
+    loss: Annotated[Literal["relative", "l2", "robust"], typer.Option(help="Loss of the pixels.")] = "relative"
+    exposure: Annotated[bool, typer.Option("--exposure", help="Fit a factor of brightness for each image.")] = False
+    tv: Annotated[float, typer.Option(help="Weight of the total variation of textures.")] = 0.02
     seed: shared.Seed = 0
 
 
@@ -34,7 +36,7 @@ class FittedOptions:
     """What is fitted."""
 
     parameter: Annotated[
-        str, typer.Option(help="Of albedo, reflectance, sigma_t, mfp, g; the texture, where there is one.")
+        str, typer.Option(help="Any of albedo, reflectance, sigma_t, mfp and g; textures where it has them.")
     ] = "albedo,sigma_t"
     model: Annotated[str, typer.Option(help="translucent_walk, neural_shape, or a model of the half-space.")] = (
         "translucent_walk"
@@ -54,9 +56,9 @@ def fit(
 ) -> None:
     """Fit the medium of an object to images: NAME_fit.toml (material), .xml (scene with it), .json (all numbers).
 
-    NAME_fit.html flips between each image and what was found.
-    A texture is written as NAME_fit_PARAMETER.exr, its standard errors as NAME_fit_PARAMETER_error.exr; an attribute of
-    a mesh with it as NAME_fit.ply, its errors as the attribute NAME_error. Errors are NaN where no view shows a texel.
+    NAME_fit.html flips between each image and its fit.
+    Textures are NAME_fit_PARAMETER.exr and their standard errors NAME_fit_PARAMETER_error.exr. Attributes of a mesh and
+    their errors (NAME_error) are in NAME_fit.ply. Errors are NaN where no view shows a texel.
     """
     use_mitsuba(variant)
     from full_geometry import inverse

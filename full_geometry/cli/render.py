@@ -35,7 +35,7 @@ class UntilOptions:
 
     spp: Annotated[
         int | None,
-        typer.Option(help="Samples for each pixel.", parser=shared.whole, show_default="64, or what else ends it"),
+        typer.Option(help="Samples for each pixel.", parser=shared.whole, show_default="64, or another end"),
     ] = None
     target_error: Annotated[float | None, typer.Option(help="Stop at this relative error of the image.")] = None
     seconds: Annotated[float | None, typer.Option(help="Stop after this time of rendering.")] = None
@@ -63,13 +63,13 @@ class TransportOptions:
     light: Annotated[
         str | None,
         typer.Option(
-            help="Of models sampled (no bias), gathered once (little bias, no noise of orders from two on), auto; of "
-            "path_traced precomputed (bias below .3 %), sampled, or auto.",
-            show_default="of models sampled, of path_traced auto, or the scene's",
+            help="Models: sampled (no bias), gathered (little bias, no noise of orders from two on) or auto. "
+            "path_traced: precomputed (bias below .3 %), sampled or auto.",
+            show_default="models: sampled; path_traced: auto; or the scene's",
         ),
     ] = None
     train_seconds: Annotated[
-        float, typer.Option(help="Train each object without weights first, for so long; 0 refuses it.")
+        float, typer.Option(help="Seconds to train each object without weights first; 0 refuses such objects.")
     ] = 0.0
     train_error: Annotated[float, typer.Option(help="Error at which an object is trained enough.")] = 0.03
 
@@ -89,7 +89,7 @@ class ImageOptions:
 
     seed: shared.Seed = 0
     sensor: Annotated[str, typer.Option(help="Number of the sensor, several as 0,1, or all.")] = "0"
-    denoise: Annotated[bool, typer.Option("--denoise", help="An image without noise beside the other.")] = False
+    denoise: Annotated[bool, typer.Option("--denoise", help="Also write a denoised image.")] = False
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with the unfinished or finished render of the same settings.")
     ] = False
@@ -107,8 +107,8 @@ def render(
 ) -> None:
     """Render a scene: NAME_MODEL.exr with variance, .png, and .html; error, samples and time are printed.
 
-    Until it is done, NAME_MODEL.unfinished.exr holds it, and the files of before stay. Objects whose model has to be
-    trained are trained first where --train-seconds says so, by walks that join the image.
+    NAME_MODEL.unfinished.exr holds an unfinished render; earlier files stay until the new one is done. --train-seconds
+    trains objects without weights first, by walks that join the image.
     """
     use_mitsuba(variant)
     from full_geometry.integrators.bssrdf import is_bssrdf
@@ -250,7 +250,7 @@ class _Bars:
     def kept(self, part: Path) -> str:
         """What an interrupt leaves."""
         if self.title == "learning":
-            return f"what was learnt up to the last checkpoint is kept for --resume beside {part}"
+            return f"the training up to the last checkpoint is kept for --resume beside {part}"
         return f"{self.so_far} samples a pixel are kept for --resume in {part}" if self.so_far else ""
 
     def _begin(self, title: str) -> None:

@@ -26,18 +26,20 @@ class TradeOptions:
     """How good, how often, how soon."""
 
     tolerance: Annotated[float, typer.Option(help="Relative error, bias and noise together.")] = 0.05
-    images: Annotated[int, typer.Option(help="How many are to be rendered.", parser=shared.whole)] = 1
-    seconds: Annotated[float | None, typer.Option(help="That the whole job may take.", show_default="no limit")] = None
+    images: Annotated[int, typer.Option(help="Number of images to render.", parser=shared.whole)] = 1
+    seconds: Annotated[float | None, typer.Option(help="Longest time of the whole job.", show_default="no limit")] = (
+        None
+    )
 
 
 @dataclass(frozen=True)
 class MeasuringOptions:
     """What is measured of a scene."""
 
-    every: Annotated[bool, typer.Option("--all", help="Every way, also those that cannot win.")] = False
+    every: Annotated[bool, typer.Option("--all", help="Measure every technique, also those that cannot win.")] = False
     assess: Annotated[float, typer.Option(help="Seconds of measuring for each object.")] = 4.0
     train_seconds: Annotated[
-        float, typer.Option(help="Learn objects without weights first, for so many seconds each; the time counts.")
+        float, typer.Option(help="Seconds to train each object without weights first; the job's time includes them.")
     ] = 0.0
     sensor: shared.SensorNumber = 0
     seed: shared.Seed = 0
@@ -50,10 +52,16 @@ def trade(
     on: SceneOptions,
     what: Annotated[
         str | None,
-        typer.Argument(help="A Mitsuba XML file, or a material for curves.", show_default="the shipped table"),
+        typer.Argument(
+            help="A Mitsuba XML file, or a material for curves.",
+            metavar="SCENE_OR_MATERIAL",
+            show_default="the shipped table",
+        ),
     ] = None,
     model: shared.Models = None,
-    r: Annotated[str | None, typer.Option(help="Of a material: smallest and largest distance, mm, as 0.1,20.")] = None,
+    r: Annotated[
+        str | None, typer.Option(help="Smallest and largest distance for curves of a material, mm, as 0.1,20.")
+    ] = None,
     out: shared.OutFolder = Path("trade"),
 ) -> None:
     """Measure speed against accuracy: a table, a recommendation, CSV, JSON, and the figure and page of a scene."""

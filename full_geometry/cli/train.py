@@ -16,7 +16,7 @@ from halfspace_sss.cli.train import ResultOptions, Work, need_torch
 if TYPE_CHECKING:
     from full_geometry.learning.records import LearntObject
 
-Seconds = Annotated[float, typer.Option(help="Time for data and fit, without compiling.")]
+Seconds = Annotated[float, typer.Option(help="Seconds for data and fit, without compilation.")]
 
 
 def train_object(
@@ -26,7 +26,7 @@ def train_object(
     places: shared.Places,
     object: Annotated[  # noqa: A002
         list[str] | None,
-        typer.Option(help="Its id in the scene; repeat for more.", show_default="the only translucent one"),
+        typer.Option(help="Id of the object in the scene; repeat for more.", show_default="the only translucent one"),
     ] = None,
     seconds: Seconds = 60.0,
     model: Annotated[
@@ -39,7 +39,7 @@ def train_object(
         ),
     ] = None,
 ) -> None:
-    """Train the networks of objects of a scene, which `render` then knows, and say how wrong they are."""
+    """Train networks of objects of a scene for `render`, and print their errors."""
     need_torch()
     parameters = on.parameters()
     use_mitsuba(on.variant)

@@ -503,7 +503,7 @@ def _load(path: Path, of: str, descent: FitDescent) -> None:
     except (OSError, ValueError, EOFError) as error:
         raise ValueError(f"{path} must be the state of a fit, got {error}") from error
     if str(arrays["of"]) != of:
-        raise ValueError(f"work must be a new folder or that of the same fit, got another one in {path.parent}")
+        raise ValueError(f"work must be a new folder or come from the same fit, got another one in {path.parent}")
     descent.comparison.factors[:] = arrays.pop("factors")
     for key in [key for key in arrays if key.startswith("shown ")]:
         descent.comparison.shown[int(key.split()[1])] = arrays.pop(key)

@@ -617,8 +617,8 @@ class TextureDescent:
             told.append(f"{n} of {x.size} variables of {v.name} are at a bound")
         if dark.any():
             told.append(
-                f"{int(dark.sum())} of {len(dark)} texels or vertices of {v.name} are seen by no view: they are "
-                "the first guess, or what their neighbours make of it, and their errors NaN"
+                f"{int(dark.sum())} of {len(dark)} texels or vertices of {v.name} are seen by no view: they keep "
+                "the first guess or follow their neighbours, and their errors are NaN"
             )
         return told
 

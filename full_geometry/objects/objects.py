@@ -202,7 +202,7 @@ def _check_media(scene: mi.Scene, shapes: list[mi.Shape]) -> None:
     for side, shape in results:
         if surface_of(shape):
             raise ValueError(
-                f"a translucent object must be without {side}, as its surface says what is inside, got the {side} "
+                f"a translucent object must be without {side}, as its surface states the medium, got the {side} "
                 f"of {shape.id()!r}"
             )
     if results:
@@ -514,19 +514,19 @@ def _check_inclusions(name: str, inclusions: Inclusions) -> None:
     for inclusion, spec in zip(inclusions.found, inclusions.specs):
         shape = inclusion.node
         if inclusion.shown:
-            raise ValueError(f"what lies inside {name} must be no instance to be learnt, got {inclusion.name}")
+            raise ValueError(f"inclusions of {name} must be no instances to be learnt, got {inclusion.name}")
         if not (mesh.has_faces(shape) or "to_world" in mi.traverse(shape)):
             raise ValueError(
-                f"what lies inside {name} must be a mesh or have a transformation to be learnt, got the "
+                f"inclusions of {name} must be meshes or have a transformation to be learnt, got the "
                 f"{shape.class_name()} {name_of(shape)}"
             )
         if spec is None and shape.bsdf().flags() & _DELTAS:
             raise ValueError(
-                f"what lies inside {name} must be opaque and no mirror, or translucent, to be learnt, as S holds no "
+                f"inclusions of {name} must be opaque and no mirror, or translucent, to be learnt, as S holds no "
                 f"deltas, got the shape {name_of(shape)} with a {shape.bsdf().class_name()}"
             )
         if spec is not None and not spec.is_homogeneous:
-            raise ValueError(f"media inside {name} must be homogeneous to be learnt, got that of {name_of(shape)}")
+            raise ValueError(f"media inside {name} must be homogeneous to be learnt, got {name_of(shape)}")
 
 
 def _object_of(scene: mi.Scene, name: str | None) -> mi.Shape:

@@ -175,7 +175,7 @@ def obstacle(media: WalkMedia) -> str:
         if not obj.closed:
             return f"object {obj.name} is not closed"
         if inside.textured is not None and "sigma_t" not in inside.textured.constants:
-            return f"sigma_t of object {obj.name} has a texture, of which each walk takes its own value"
+            return f"sigma_t of object {obj.name} has a texture, and each walk takes its own value"
         if around is not None and (around.mixes or around.bend is not None):
             return f"the surface of object {obj.name} is masked, blended, or has a normal or bump map"
         if inside.orders != "total":

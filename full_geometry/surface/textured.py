@@ -64,8 +64,8 @@ class AlbedoTable:
         above = (values > self.most * (1 + 1e-6)).any(axis=1)
         if above.any():
             warnings.warn(
-                f"{int(above.sum())} of {len(above)} texels of reflectance are above {_short(self.most)}, that of a "
-                "medium without absorption, and are clipped",
+                f"{int(above.sum())} of {len(above)} texels of reflectance are above {_short(self.most)}, the "
+                "reflectance without absorption, and are clipped",
                 stacklevel=2,
             )
 

@@ -566,7 +566,7 @@ def _clipped(values: dict[str, Any]) -> np.ndarray:
     above = int((most * (1 + 1e-6) < R).sum())
     if above:
         warnings.warn(
-            f"{above} of {len(R)} wavelengths of reflectance are above {most.min():.4g}, that of a medium without "
+            f"{above} of {len(R)} wavelengths of reflectance are above {most.min():.4g}, the reflectance without "
             "absorption, and are clipped",
             stacklevel=2,
         )

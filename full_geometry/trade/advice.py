@@ -218,7 +218,7 @@ def _told(assessed: ObjectTrade, option: _Raw, best: _Raw, job: Job) -> Option:
         why += f", allowed {_time(job.seconds)}" if over else f", {short(took / best[0])} times as long" + f" ({off})"
         why += _training(row, job)
     elif row.bias2 - 2 * row.bias2_error < job.tolerance**2:
-        why = f"{row.way} is {off}: whether it keeps {job.tolerance:.3g} cannot be told from so few samples"
+        why = f"{row.way} is {off}: whether it keeps {job.tolerance:.3g} cannot be measured with so few samples"
     else:
         why = f"{row.way} is {off}, asked {100 * job.tolerance:.3g} %"
     return Option(row.way, took, int(spp), error, why)

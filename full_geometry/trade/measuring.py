@@ -234,7 +234,7 @@ class SceneSamples:
 
 
 def _unseen(name: str, mfp: tuple[float, float]) -> ObjectTrade:
-    note = f"object {name!r} is hardly seen by the camera, if at all: nothing can be told of it"
+    note = f"object {name!r} is hardly seen by the camera, if at all: nothing can be measured of it"
     return ObjectTrade(name, mfp, 0.0, 0.0, (), (), (note,))
 
 

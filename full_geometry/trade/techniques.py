@@ -82,7 +82,7 @@ class Technique:
         check_choice("way", model, (PATH_TRACED, *(m for m in model_names() if m != AUTO)))
         of_model = (NO_SINGLE,) if model == LAMBERT else (NO_SINGLE, GATHERED)
         for part in more:
-            check_choice(f"what follows {model}", part, (PRECOMPUTED,) if model == PATH_TRACED else of_model)
+            check_choice(f"light of {model}", part, (PRECOMPUTED,) if model == PATH_TRACED else of_model)
         light = next((part for part in more if part != NO_SINGLE), "sampled")
         return cls(model, "multiple" if NO_SINGLE in more else None, light)
 

@@ -186,8 +186,8 @@ def check_turns(geometry: Geometry, media: Sequence[Medium], model: str) -> None
     if share > MOST_STRAIGHT:
         raise ValueError(
             f"object {geometry.name} must let at most {100 * MOST_STRAIGHT:g} % of the light pass unscattered under "
-            f"the model {model!r}, got {100 * share:.3g} %, counting what is turned little: the model neural_shape and "
-            "the integrator translucent_walk trace it"
+            f"the model {model!r}, got {100 * share:.3g} %, with light that is turned little: the model neural_shape "
+            "and the integrator translucent_walk trace it"
         )
 
 

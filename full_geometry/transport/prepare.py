@@ -55,7 +55,7 @@ Chooser = Callable[[Any, Settings], Choices]  # says what stands for "auto" in a
 def _check_repeated(geometry: Geometry, spec: MediumSpec, settings: Settings) -> None:
     """ValueError if instances of an object are not what its model or light takes."""
     if spec.varying is not None:
-        raise ValueError(f"the medium of an instance must not vary in space, got that of object {geometry.name}")
+        raise ValueError(f"the medium of an instance must not vary in space, got object {geometry.name}")
     if settings.light == "gathered":
         raise ValueError(f"light must be sampled of objects that instances show, got gathered of {geometry.name}")
     stretched = geometry.group.stretch > RIGID

@@ -93,7 +93,7 @@ class Identity:
         """
         pairs = (
             ("kind", "shape", "without faces"), ("topology", "mesh", "without faces"), ("grids", "grids", "none"),
-            ("contents", "what lies inside", "nothing"), ("textures", "textures", "none"),
+            ("contents", "inclusions", "nothing"), ("textures", "textures", "none"),
         )  # fmt: skip
         for key, name, none in pairs:
             mine, theirs = getattr(self, key), getattr(other, key)
@@ -301,7 +301,7 @@ CHECKSUMS = "start_checksums"  # of a record
 CENTRES, TRUSTED, TURNS, ENDS = "centres", "even", "turns", "Q"
 S_LAYERS, ALPHA_LAYERS, PATCH_LAYERS = ("W_", "b_", ENDS), ("A_", "a_"), ("V_", "c_")
 NEEDED = (
-    (TRUSTED, "directional albedo must be learnt"), (TURNS, "turns of what surrounds a point must be known"),
+    (TRUSTED, "directional albedo must be learnt"), (TURNS, "turns of the surroundings of a point must be known"),
     (ENDS, "functions of ends must be solved for"),
 )  # fmt: skip
 
@@ -434,7 +434,7 @@ def _trained(path: Path) -> tuple[Identity, dict[str, np.ndarray], dict[str, Any
         if {"albedo", "g", "eta", "size_in_mfp"} - set(identity.medium):
             raise KeyError("medium")
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path.with_suffix('.json')}: record must be that of an object, {error} is wrong") from error
+        raise ValueError(f"{path.with_suffix('.json')}: record must describe an object, {error} is wrong") from error
     return identity, arrays, record
 
 

@@ -76,7 +76,7 @@ class InclusionTable:
         glass = [analyse_shape(thing, scene) for thing in _shapes(result) if _displaces(thing)]
         for piece in glass:
             if not piece.closed:
-                raise ValueError(f"what refracts inside an object must be closed, got the shape {piece.name}")
+                raise ValueError(f"refracting inclusions of an object must be closed, got the shape {piece.name}")
         if glass:
             result = find_inclusions(scene, [*objects, *glass])
 
@@ -149,7 +149,7 @@ def _check(result: list[Inclusion], objects: list[Geometry], instance_table: Ins
                 )
             if not inclusion.whole and (translucent or _displaces(inclusion.node)):
                 raise ValueError(
-                    f"what refracts must lie inside an object or outside, got {inclusion.name} partly inside "
+                    f"refracting shapes must lie inside an object or outside, got {inclusion.name} partly inside "
                     f"object {holder.name}"
                 )
             surfaces += [surface_of(inclusion.node)] if translucent else []
@@ -662,7 +662,7 @@ class WalkMedia:
                     f"{100 * obj.lost:.3g} % of the rays that enter it do not leave again: use a half-space model"
                 )
             if inside.varying is not None and group is not None:
-                raise ValueError(f"the medium of an instance must not vary in space, got that of object {obj.name}")
+                raise ValueError(f"the medium of an instance must not vary in space, got object {obj.name}")
             if inside.textured is not None:
                 inside.textured.check(obj)
 

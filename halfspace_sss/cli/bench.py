@@ -27,7 +27,7 @@ PARTS = tuple(part.value for part in BenchPart)
 SECONDS = {"walk": 1, "volpath": 15, "models": 3, "maps": 100}  # about, for a row; only the time left depends on it
 TITLES = {
     "walk": "walk at normal incidence, flux alone or with peel-off towards one direction",
-    "volpath": "Mitsuba's volpath for the same reflectance: time for equal error over that of the walk",
+    "volpath": "Mitsuba's volpath for the same reflectance: time for equal error over the time of the walk",
     "models": "evaluations of S per second, float32; NumPy runs on one thread, torch and Dr.Jit on all",
     "maps": "training maps to a mean cell error",
 }

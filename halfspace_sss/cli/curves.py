@@ -93,7 +93,7 @@ def error_table(result: CurveSet) -> Table:
     title = f"{result.title}: " if result.title else ""
     title += f"sigma_t {m.sigma_t:.4g}/mm, albedo {m.albedo:.4g}, g {m.g:.3g}, eta {m.eta:.4g}; "
     title += f"theta_o {result.theta_o_deg:g}°, line at {result.line_deg:g}°"
-    caption = "* contains single scattering, of which the path-traced curve has none; its R is compared at total."
+    caption = "* contains single scattering, which the path-traced curve lacks; its R is compared at total."
     return shared.table(headings, rows, title=title, caption=caption)
 
 

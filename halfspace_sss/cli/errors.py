@@ -34,7 +34,7 @@ class MediaOptions:
         int | None, typer.Option(help="This many random media over the range of `neural`.", parser=shared.whole)
     ] = None
     as_trained: Annotated[
-        bool, typer.Option("--as-trained", help="Held-out media as for the training: a third of them with g near 1.")
+        bool, typer.Option("--as-trained", help="Draw held-out media as in training: a third with g near 1.")
     ] = False
 
 
@@ -90,7 +90,7 @@ def errors_materials(
 
 
 def errors_truths(model: shared.Models = None, out: shared.OutFolder = Path("errors")) -> None:
-    """Compare reflectances of models with published and exact values: minutes; goes on where it was."""
+    """Compare reflectances of models with published and exact values; an interrupted run goes on."""
     from halfspace_sss.comparison.model_truths import reflectance_truths, truth_summary, truths_cost
     from halfspace_sss.kept_rows import KeptRows
     from halfspace_sss.provenance import check_folder, write_atomically

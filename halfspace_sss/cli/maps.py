@@ -51,7 +51,9 @@ def maps(
     channel: Annotated[
         str | None, typer.Option(help="Only these, as R,B, a store each.", show_default="all in one store")
     ] = None,
-    name: Annotated[str | None, typer.Option(help="Store of a stated medium.", show_default="medium")] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of the store of a medium given by coefficients.", show_default="medium")
+    ] = None,
     share: Annotated[str, typer.Option(help="k/n: of n processes that fill one folder, this is number k < n.")] = "0/1",
     out: Annotated[
         Path,

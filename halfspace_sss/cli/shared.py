@@ -333,7 +333,9 @@ Models = Annotated[
     list[str] | None,
     typer.Option(help="A model; repeat for more.", metavar="NAME", show_default="all", autocompletion=_complete_models),
 ]
-ObjectId = Annotated[str | None, typer.Option(help="Its id in the scene.", show_default="the only translucent one")]
+ObjectId = Annotated[
+    str | None, typer.Option(help="Id of the object in the scene.", show_default="the only translucent one")
+]
 SensorNumber = Annotated[int, typer.Option(help="Number of the sensor.", parser=whole)]
 Seed = Annotated[int, typer.Option(help="Seed of random numbers.", parser=_seed)]
 OutFolder = Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")]

@@ -66,7 +66,7 @@ def train_material(
     material: shared.Materials = None,
     channel: shared.Channels = None,
 ) -> None:
-    """Train the network of a medium, for each channel of materials or of the coefficients that are given."""
+    """Train networks of media: one for each channel of the materials, or for the given coefficients."""
     need_torch()
     from halfspace_sss.executors import completed
     from halfspace_sss.neural.training.train_material import FAST, STANDARD
@@ -92,7 +92,7 @@ def train_universal(
     backend: shared.Backend = "llvm",
     out: shared.OutFolder = Path("universal"),
 ) -> None:
-    """Train the network for all media, in half an hour; the folder also holds what a killed run goes on with."""
+    """Train the network for all media, in half an hour; a killed run goes on in the same folder."""
     need_torch()
     from halfspace_sss.neural.training.train_universal import UniversalRecipe
     from halfspace_sss.neural.training.train_universal import train_universal as trained

@@ -170,7 +170,7 @@ def _legend(figure: Figure, curves: PlottedCurves, columns: int) -> None:
         handles.append(Line2D([], [], color=style.color, ls=style.dash, label=_label(c)))
     starred = any(c.orders == "total" for c in firsts)
     figure.legend(
-        title="* contains single scattering, of which the path-traced curve has none" if starred else None,
+        title="* contains single scattering, which the path-traced curve lacks" if starred else None,
         title_fontsize=7,
         handles=handles, loc="outside lower center", ncols=4 if columns > 2 else 2, frameon=False,
         handlelength=2.8, columnspacing=1.4, borderaxespad=0.1,

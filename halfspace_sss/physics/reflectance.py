@@ -197,8 +197,7 @@ def albedo_of_reflectance(reflectance: np.ndarray, g: float, eta: float, mu_i: f
     if not reached.all():
         wrong = R[~reached].flat[0]
         raise ValueError(
-            f"reflectance must be in [0, {most:.4g}], what a medium without absorption reflects at eta {eta:g}, "
-            f"got {float(wrong)!r}"
+            f"reflectance must be in [0, {most:.4g}], the most without absorption at eta {eta:g}, got {float(wrong)!r}"
         )
     result, slope = np.interp(R, values, x), polynomial.deriv()
     for _ in range(STEPS):

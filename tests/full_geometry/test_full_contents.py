@@ -178,7 +178,7 @@ def test_weights_belong_to_what_lies_inside_at_its_place() -> None:
     others = {name: identity_of(inside()) for name, inside in EDITS.items()}
     for name, other in others.items():
         moved = name in ("smaller", "a little off", "mirrored")
-        wanted = "moved and turned only" if moved else "what lies inside must be .*, as trained, got"
+        wanted = "moved and turned only" if moved else "inclusions must be .*, as trained, got"
         with pytest.raises(ValueError, match=wanted):
             trained.pose(other)
         assert (trained.digest() == other.digest()) <= moved, name
@@ -219,7 +219,7 @@ def hair() -> dict:
     return {"type": "bsplinecurve", "filename": file.name, "bsdf": BLACK}
 
 
-DELTA = "inside 'wax' must be opaque and no mirror, or translucent, to be learnt, .* the shape 'thing' with a "
+DELTA = "inclusions of 'wax' must be opaque and no mirror, or translucent, to be learnt, .* the shape 'thing' with a "
 REFUSED: dict[str, tuple[Callable[[], dict], str]] = {
     "glass": (lambda: ball(0.3, bsdf={"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.4}), DELTA + "SmoothDiel"),
     "frosted": (lambda: ball(0.3, bsdf={"type": "roughdielectric", "int_ior": 1.5, "ext_ior": 1.4}), DELTA + "RoughD"),
@@ -230,7 +230,7 @@ REFUSED: dict[str, tuple[Callable[[], dict], str]] = {
     "varying": (lambda: ball(0.3, bsdf=varying()), "media inside 'wax' must be homogeneous to be learnt, .* 'thing'"),
     "led": (lambda: ball(0.1, emitter={"type": "area"}), "must be empty for .*, got the shape 'thing' inside"),
     "lamp": (lambda: {"type": "point"}, "must be empty for .*, got the emitter 'thing' inside object 'wax'"),
-    "curve": (hair, "must be a mesh or have a transformation to be learnt, got the BSplineCurve 'thing'"),
+    "curve": (hair, "must be meshes or have a transformation to be learnt, got the BSplineCurve 'thing'"),
     "wick": (lambda: ball(0.3, (0, 1, 0), bsdf=BLACK), "must be empty for .*, got the shape 'thing' partly inside"),
 }
 

@@ -227,7 +227,7 @@ def test_the_work_of_another_version_is_refused(interrupted: Any, monkeypatch: A
 @pytest.mark.parametrize("left", ["checkpoint.safetensors", "maps-3-1-00000.npy"])
 def test_work_of_which_nothing_is_known_is_refused(tmp_path: Path, left: str) -> None:
     (tmp_path / left).write_bytes(b"")
-    with pytest.raises(ValueError, match=rf"{tmp_path}: work must be that of a known run, got {left} without run.json"):
+    with pytest.raises(ValueError, match=rf"{tmp_path}: work must come from a known run, got {left} without run.json"):
         run_universal(tmp_path)
 
 

@@ -28,7 +28,7 @@ def claim(folder: Path, **run: object) -> None:
     if not place.exists():
         left = sorted(path.name for pattern in WORK for path in folder.glob(pattern))
         if left:
-            raise ValueError(f"{folder}: work must be that of a known run, got {left[0]} without {RUN}; remove it")
+            raise ValueError(f"{folder}: work must come from a known run, got {left[0]} without {RUN}; remove it")
         write_atomically(place, to_json(run))
         return
     wanted, result = _flat(json.loads(to_json(run))), _flat(_read(place))
