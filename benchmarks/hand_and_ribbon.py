@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from full_geometry.learning.meshes import Box, Distance, capsule, join, twisted
-from full_geometry.learning.shapes import box, margin
+from full_geometry.learning.meshes import Box, Distance, box, capsule, join, margin, twisted
 
 Made = tuple[Distance, Box]
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from figures.modelling.leaf import Made, leaves
-from full_geometry.learning.meshes import capsule, cut, join, length, overlap, rotated, smoothstep
-from full_geometry.learning.shapes import margin
+from full_geometry.learning.meshes import capsule, cut, join, length, margin, overlap, rotated, smoothstep
 
 STROKES = {  # of letters, in a square
     "A": [((0, 0), (0.5, 1)), ((0.5, 1), (1, 0)), ((0.2, 0.4), (0.8, 0.4))],

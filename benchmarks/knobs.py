@@ -17,9 +17,8 @@ import numpy as np
 
 from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.trade.assessing import assess_stage
-from full_geometry.trade.job import Effort
 from full_geometry.trade.results import ObjectTrade
-from full_geometry.trade.techniques import Stage, Technique
+from full_geometry.trade.techniques import Effort, Stage, Technique
 from halfspace_sss.arrays import Lanes
 from halfspace_sss.backend import clock
 from halfspace_sss.comparison.model_errors import model_error, references

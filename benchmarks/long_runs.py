@@ -12,10 +12,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from full_geometry.trade.assessing import assess_stage
-from full_geometry.trade.job import Effort
 from full_geometry.trade.results import Assessment, ObjectTrade, TechniqueTrade
 from full_geometry.trade.statistics import seeded
-from full_geometry.trade.techniques import Stage, Technique
+from full_geometry.trade.techniques import Effort, Stage, Technique
 from halfspace_sss.provenance import provenance, write_atomically
 
 FORMAT = "halfspace-sss trade truth 2"

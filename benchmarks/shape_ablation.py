@@ -11,8 +11,15 @@ import numpy as np
 import torch
 
 from benchmarks.held_out import HELD_OUT
-from full_geometry.learning.shape_data import PairData, draw_object, grouped, make_data, mean_events
-from full_geometry.learning.shape_training import STANDARD, ShapeFit
+from full_geometry.learning.shape_training import (
+    STANDARD,
+    PairData,
+    ShapeFit,
+    draw_object,
+    grouped,
+    make_data,
+    mean_events,
+)
 from full_geometry.transport.descriptors import N_LENGTHS, N_OWN
 from halfspace_sss.progress import NamedProgress
 

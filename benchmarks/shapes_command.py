@@ -69,7 +69,7 @@ def shapes_command(
         )
         if pictures is not None:
             from benchmarks.shape_errors import worst_pictures
-            from full_geometry.scenes.picture import as_png
+            from full_geometry.scenes.reference_store import as_png
 
             write_atomically(pictures, as_png(worst_pictures(rows, show)[..., None]))
         if work is not None:

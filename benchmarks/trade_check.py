@@ -12,10 +12,9 @@ from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.trade.advice import advise
 from full_geometry.trade.assessing import assess_for, learn
 from full_geometry.trade.automatic import picked
-from full_geometry.trade.job import Effort, Job
 from full_geometry.trade.results import Assessment, TechniqueTrade
 from full_geometry.trade.statistics import seeded
-from full_geometry.trade.techniques import Stage, Technique, stage
+from full_geometry.trade.techniques import Effort, Job, Stage, Technique, stage
 from halfspace_sss.neural.store import weights_in
 from halfspace_sss.provenance import provenance, write_atomically
 

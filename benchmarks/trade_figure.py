@@ -90,8 +90,7 @@ def measured(task: Task) -> dict[str, object]:
     """The assessment of a scene, and an image by each way."""
     from full_geometry.trade.assessing import assess_stage
     from full_geometry.trade.images import small_images, with_flip
-    from full_geometry.trade.job import Effort
-    from full_geometry.trade.techniques import stage
+    from full_geometry.trade.techniques import Effort, stage
 
     prepare()
     p, learnt = task.params, with_weights(task.folder, task.needed)

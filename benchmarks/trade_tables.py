@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from figures.drawing.trade_plot import LEAST, NOISE, pareto, span_in_mfp, time_to_noise
 from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.trade.advice import advise
-from full_geometry.trade.job import Job
 from full_geometry.trade.results import Assessment, ObjectTrade, TechniqueTrade
+from full_geometry.trade.techniques import Job
 from halfspace_sss.comparison.style import TEXT
 from halfspace_sss.noise_free import short
 

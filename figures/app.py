@@ -14,11 +14,10 @@ import typer
 
 import halfspace_sss
 from figures.parts.command import COMMANDS as FIGURES
-from full_geometry.cli.errors import errors_object
 from full_geometry.cli.fit import fit
 from full_geometry.cli.render import render
 from full_geometry.cli.trade import trade
-from full_geometry.cli.train import train_object, train_shapes
+from full_geometry.cli.train import errors_object, train_object, train_shapes
 from full_geometry.cli.variants import Drawers
 from halfspace_sss.cli.bench import bench
 from halfspace_sss.cli.curves import curves
@@ -32,7 +31,7 @@ from halfspace_sss.extensions import COMMANDS, FAILURES, commands, warn_left_out
 
 if TYPE_CHECKING:
     from full_geometry.inverse.comparing import MaterialFit
-    from full_geometry.scenes.picture import Picture
+    from full_geometry.scenes.reference_store import Picture
     from full_geometry.trade.images import TradePicture
 
 GROUPS: Mapping[str, tuple[str, Mapping[str, Callable]]] = {

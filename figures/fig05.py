@@ -16,8 +16,8 @@ from figures.parts.part import Part, Result, Task
 from figures.parts.records import Params, Row
 from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.learning import online
+from full_geometry.learning.online import combined
 from full_geometry.scenes import reference
-from full_geometry.scenes.combined import combined
 from full_geometry.scenes.reference_store import Reference
 from full_geometry.trade.image_differences import srgb
 from full_geometry.transport.storing import KIND
@@ -242,7 +242,7 @@ def modelled(p: Params, folder: Path, seconds: float) -> Snapshots:
 
 def walked(p: Params, folder: Path, seconds: float) -> Snapshots:
     """Walks alone."""
-    from full_geometry.capabilities import PATH_TRACED
+    from full_geometry.settings import PATH_TRACED
 
     return _rendered(_scene(p, PATH_TRACED), folder / "walked.exr", p["seed"] + 2, seconds)
 

@@ -13,8 +13,7 @@ from halfspace_sss.backend import BackendError, prepare_llvm, two_threads
 if TYPE_CHECKING:
     import mitsuba as mi
 
-    from full_geometry.capabilities import Choices
-    from full_geometry.settings import Settings
+    from full_geometry.settings import Choices, Settings
 
 TRADE = "full_geometry.trade.automatic"
 _active = False

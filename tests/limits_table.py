@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-from full_geometry.capabilities import Capabilities
+from full_geometry.settings import Capabilities
 from full_geometry.transport.models import MODELS, WALKS, lookup
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "limits.md"

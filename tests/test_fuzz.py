@@ -38,7 +38,7 @@ COMPUTES = [  # what is replaced: the properties are of what comes before the co
     "full_geometry.trade.flat.references", "full_geometry.trade.assessing.assess_stage",
     "full_geometry.trade.assessing.assess_for",
     "full_geometry.learning.shape_training._ShapeTraining", "full_geometry.learning.training._ObjectTraining",
-    "full_geometry.learning.object_learner.errors_of", "full_geometry.inverse.fitting.MediumDescent",
+    "full_geometry.learning.learners.errors_of", "full_geometry.inverse.fitting.MediumDescent",
 ]  # fmt: skip
 ODD = ["", " ", "nan", "inf", "-inf", "-1", "0", "1", "2", "0.5", "1e6", "1e400", "1,2", "0,", "1/2", "2/1", "marble",
        "R", "fig10", "neural", "better_dipole", "total", "single", "llvm", "cuda", "[/red]", "[bold", "{", "%s", "../x",

@@ -6,7 +6,7 @@ from dataclasses import fields, replace
 
 import limits_table
 
-from full_geometry.capabilities import Capabilities
+from full_geometry.settings import Capabilities
 
 
 def test_the_table_of_the_page_is_that_of_the_capabilities() -> None:

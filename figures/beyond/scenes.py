@@ -16,8 +16,7 @@ from figures.modelling.head import make_head, write_painted
 from figures.modelling.leaf import LEAVES
 from figures.parts.part import Part, Result, Task, unmodelled
 from figures.parts.records import SceneDict
-from full_geometry.learning.meshes import Box, surface
-from full_geometry.learning.shapes import box, make_shape
+from full_geometry.learning.meshes import Box, box, make_shape, surface
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder
 

@@ -14,7 +14,7 @@ from figures.drawing.image_files import against_walks, image_files, rows_of
 from figures.modelling.leaf import LEAVES
 from figures.parts.part import Part, Result, Task, unmodelled
 from figures.parts.records import SceneDict
-from full_geometry.learning.shapes import TRAINING, make_shape
+from full_geometry.learning.meshes import TRAINING, make_shape
 from halfspace_sss import materials
 from halfspace_sss.provenance import check_folder
 

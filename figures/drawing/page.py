@@ -20,7 +20,7 @@ from halfspace_sss.provenance import JsonDict
 
 if TYPE_CHECKING:
     from full_geometry.inverse.comparing import MaterialFit
-    from full_geometry.scenes.picture import Picture
+    from full_geometry.scenes.reference_store import Picture
 
 
 DIFFERENCE_SPAN = 1.0  # relative difference at the ends of the colours

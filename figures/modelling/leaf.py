@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from full_geometry.learning.meshes import Box, Distance, capsule, join, overlap
-from full_geometry.learning.shapes import margin
+from full_geometry.learning.meshes import Box, Distance, capsule, join, margin, overlap
 
 Made = tuple[Distance, Box]
 

@@ -16,9 +16,8 @@ from halfspace_sss.cli import shared
 if TYPE_CHECKING:
     import numpy as np
 
-    from full_geometry.scenes.picture import Picture
     from full_geometry.scenes.reference import Limits
-    from full_geometry.scenes.reference_store import Reference
+    from full_geometry.scenes.reference_store import Picture, Reference
 
 SPP = 64
 ENDINGS = ("png", "html", "denoised.exr", "denoised.png")  # of what is drawn
@@ -112,8 +111,8 @@ def render(
     """
     use_mitsuba(variant)
     from full_geometry.integrators.bssrdf import is_bssrdf
-    from full_geometry.scenes.picture import Picture
     from full_geometry.scenes.reference import chosen
+    from full_geometry.scenes.reference_store import Picture
     from halfspace_sss.locks import one_writer
     from halfspace_sss.provenance import check_folder
 
@@ -151,7 +150,7 @@ def _off(scene: Any, image: np.ndarray, sensor: int, model: str | None) -> list[
     """How far off models are on each object of an image, where walks can tell."""
     import mitsuba as mi
 
-    from full_geometry.scenes.against_walks import mean_ratios, told
+    from full_geometry.learning.model_errors import mean_ratios, told
     from full_geometry.scenes.scene_files import first_cause
 
     if mi.is_spectral or scene.integrator().settings.orders:
@@ -166,9 +165,9 @@ def _opened(scene: Path, transport: TransportOptions, parameters: dict[str, str]
     """The scene; where all models are "auto" by walks, if these are the cheapest that keep the tolerance."""
     import mitsuba as mi
 
-    from full_geometry.capabilities import AUTO, PATH_TRACED
     from full_geometry.integrators.bssrdf import is_bssrdf
     from full_geometry.scenes.scene_files import open_scene
+    from full_geometry.settings import AUTO, PATH_TRACED
     from full_geometry.trade.automatic import models_of, walks_instead
 
     settings = transport.settings(denoise)

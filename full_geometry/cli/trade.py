@@ -135,8 +135,7 @@ def _scene(
     from full_geometry.trade.advice import advise
     from full_geometry.trade.assessing import assess
     from full_geometry.trade.images import picture_of
-    from full_geometry.trade.job import Job
-    from full_geometry.trade.techniques import techniques
+    from full_geometry.trade.techniques import Job, techniques
     from halfspace_sss.provenance import provenance, write_together
 
     job, limits = Job(**asdict(wanted)), {"tolerance": wanted.tolerance, "images": wanted.images}

@@ -15,7 +15,7 @@ from halfspace_sss.cli.interrupts import interrupts
 
 if TYPE_CHECKING:
     from full_geometry.inverse.comparing import MaterialFit
-    from full_geometry.scenes.picture import Picture
+    from full_geometry.scenes.reference_store import Picture
     from full_geometry.trade.images import TradePicture
 
 Variant = Annotated[

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import drjit as dr
 import mitsuba as mi
 
-from full_geometry.capabilities import Choices
 from full_geometry.geometry import mesh
 from full_geometry.geometry.instances import InstanceScene
 from full_geometry.geometry.sensors import (
@@ -30,7 +29,7 @@ from full_geometry.integrators.surface_paths import replay_paths, trace_paths
 from full_geometry.objects.objects import KnowsUnit, TranslucentObject
 from full_geometry.objects.small_emitters import check_emitters
 from full_geometry.sampling.low_discrepancy import path_numbers
-from full_geometry.settings import Settings, read_settings
+from full_geometry.settings import Choices, Settings, read_settings
 from full_geometry.surface.translucent import is_translucent
 from full_geometry.surface.wrapped import wraps
 from full_geometry.transport.prepare import Chooser, TranslucentObjects, choices_of, make_objects

@@ -17,7 +17,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.capabilities import Capabilities
 from full_geometry.geometry import mesh
 from full_geometry.geometry.instances import (
     InstanceProposals,
@@ -50,7 +49,7 @@ from full_geometry.geometry.shape import (
 )
 from full_geometry.geometry.snapshot import Snapshot
 from full_geometry.objects.inclusions import Inclusion, find_inclusions, place_of
-from full_geometry.settings import check_variant
+from full_geometry.settings import Capabilities, check_variant
 from full_geometry.surface.medium_derivatives import MediumDerivatives
 from full_geometry.surface.spectral import MediumByWavelength
 from full_geometry.surface.textured import TexturedMedium

@@ -20,13 +20,12 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.capabilities import AUTO
-from full_geometry.geometry.identity import children, scene_hash, words
+from full_geometry.geometry.snapshot import children, scene_hash, words
 from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.objects.objects import translucent_shapes
 from full_geometry.scenes.reference_store import BY_CHANCE, CHANNELS, Reference, load, save
 from full_geometry.scenes.scene_files import first_cause
-from full_geometry.settings import check_variant
+from full_geometry.settings import AUTO, check_variant
 from full_geometry.surface.wrapped import surface_of
 from halfspace_sss.checks import check_count
 from halfspace_sss.locks import one_writer

@@ -10,10 +10,12 @@ import hashlib
 import json
 import math
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.provenance import write_together
@@ -110,8 +112,6 @@ def _of_parts(names: list[str]) -> list[str]:
 
 def save(path: Path, reference: Reference) -> None:
     """Write the EXR, whole or not at all, and beside it the JSON of its header for people to read, never of another."""
-    import mitsuba as mi
-
     (mean, mean_rest), (variance, variance_rest) = _halves(reference.mean), _halves(reference.variance)
     pixels = np.ascontiguousarray(np.concatenate([mean, variance, mean_rest, variance_rest], axis=2), dtype=np.float32)
     header = {
@@ -128,9 +128,7 @@ def save(path: Path, reference: Reference) -> None:
     bitmap = mi.Bitmap(pixels, mi.Bitmap.PixelFormat.MultiChannel, channel_names=names)
     text = json.dumps(header, indent=1)
     bitmap.metadata()[HEADER] = text
-    stream = mi.MemoryStream()
-    bitmap.write(stream, mi.Bitmap.FileFormat.OpenEXR)
-    write_together({path: bytes(stream.raw_buffer()), path.with_suffix(".json"): text + "\n"})
+    write_together({path: _written(bitmap, mi.Bitmap.FileFormat.OpenEXR), path.with_suffix(".json"): text + "\n"})
 
 
 def load(path: str | os.PathLike) -> Reference:
@@ -139,8 +137,6 @@ def load(path: str | os.PathLike) -> Reference:
     Raises:
         ValueError: there is no such file, or it is damaged or not one of these; the message names it.
     """
-    import mitsuba as mi
-
     name = os.fspath(path)
     if not Path(name).is_file():
         raise ValueError(f"reference must be a file, got {name!r}")
@@ -166,3 +162,56 @@ def load(path: str | os.PathLike) -> Reference:
         header.pop(key, None)
     mean, variance, mean_rest, variance_rest = np.split(pixels.astype(np.float64), 4, axis=2)
     return Reference(mean + mean_rest, variance + variance_rest, passes, spp, seconds, header)
+
+
+# --------------------------------------------------------------------------------------------------
+# A finished render as what people look at.
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A render to be drawn.
+
+    Args:
+        title: name of the scene and the model.
+        image: linear radiance (H, W, 3).
+        numbers: name -> what is known of it.
+        caption: a sentence.
+        scene, sensor: Mitsuba scene and number of the sensor, to render guides for a denoiser.
+        denoise: whether an image without noise is asked for.
+        emission: its part that has no noise to take out (H, W, 3): emitters that the camera sees, at once or in the
+            mirror of an object; None where that is not known.
+    """
+
+    title: str
+    image: np.ndarray
+    numbers: Mapping[str, str]
+    caption: str
+    scene: mi.Scene
+    sensor: int
+    denoise: bool
+    emission: np.ndarray | None = None
+
+    def png(self, image: np.ndarray | None = None) -> bytes:
+        """The image as a display shows it."""
+        return as_png(self.image if image is None else image)
+
+    def exr(self, image: np.ndarray) -> bytes:
+        """An image as it is."""
+        return as_exr(image)
+
+
+def as_exr(image: np.ndarray) -> bytes:
+    """Numbers (H, W, channels) as they are."""
+    return _written(mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32)), mi.Bitmap.FileFormat.OpenEXR)
+
+
+def as_png(image: np.ndarray) -> bytes:
+    """Linear radiance (H, W, channels) as a display shows it."""
+    return _written(mi.util.convert_to_bitmap(mi.TensorXf(image.astype(np.float32))), mi.Bitmap.FileFormat.PNG)
+
+
+def _written(bitmap: mi.Bitmap, kind: mi.Bitmap.FileFormat) -> bytes:
+    stream = mi.MemoryStream()
+    bitmap.write(stream, kind)
+    return bytes(stream.raw_buffer())

@@ -15,9 +15,8 @@ from typing import Any
 
 import mitsuba as mi
 
-from full_geometry.capabilities import PATH_TRACED
 from full_geometry.integrators.bssrdf import is_bssrdf
-from full_geometry.settings import LIGHTS, ORDERS, SHARED, WALK_LIGHTS, check_variant
+from full_geometry.settings import LIGHTS, ORDERS, PATH_TRACED, SHARED, WALK_LIGHTS, check_variant
 from full_geometry.surface.wrapped import surface_of
 from full_geometry.transport.models import model_names, of_objects
 from halfspace_sss.interrupts import is_interrupt

@@ -17,10 +17,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from full_geometry.scenes.scene_files import PATH_TRACED
-from full_geometry.trade.assessing import assess
-from full_geometry.trade.job import Job
+from full_geometry.trade.assessing import assess, once
 from full_geometry.trade.results import UNNAMED, Assessment, ObjectTrade, TechniqueTrade, html_table, samples_for
-from full_geometry.trade.techniques import GATHERED, LAMBERT, PRECOMPUTED_WALKS, Technique
+from full_geometry.trade.techniques import GATHERED, LAMBERT, PRECOMPUTED_WALKS, Job, Technique
 from halfspace_sss.noise_free import short
 from halfspace_sss.physics.medium import Medium
 
@@ -180,16 +179,12 @@ def _object(assessed: ObjectTrade, job: Job) -> ObjectAdvice:
 _Raw = tuple[float, float, float, TechniqueTrade]  # seconds, samples of a pixel, error, the way
 
 
-def _once(row: TechniqueTrade, job: Job) -> float:
-    return row.preparation + (row.training if job.count_training else 0.0)
-
-
 def _option(assessed: ObjectTrade, row: TechniqueTrade, job: Job) -> _Raw:
     needed = samples_for(row, job.tolerance)
     if not needed < math.inf:
         return math.inf, 0.0, row.bias, row
     spp = max(math.ceil(needed), 1)
-    took = _once(row, job) + job.images * assessed.pixels * spp * row.seconds
+    took = once(row, job) + job.images * assessed.pixels * spp * row.seconds
     return took, spp, math.hypot(row.bias, math.sqrt(row.variance / spp)), row
 
 
@@ -197,7 +192,7 @@ def _in_time(assessed: ObjectTrade, row: TechniqueTrade, job: Job) -> _Raw:
     """Samples and error of a technique in the time that is allowed; its bias where there is no limit."""
     if job.seconds is None:
         return math.inf, 0, row.bias, row
-    left = job.seconds - _once(row, job)
+    left = job.seconds - once(row, job)
     spp = math.floor(left / (job.images * assessed.pixels * row.seconds)) if left > 0 else 0
     error = math.hypot(row.bias, math.sqrt(row.variance / spp)) if spp > 0 else math.inf
     return float(job.seconds), spp, error, row

@@ -18,20 +18,19 @@ from typing import Any, NamedTuple
 
 import mitsuba as mi
 
-from full_geometry.capabilities import AUTO, PATH_TRACED, Choices
-from full_geometry.geometry.identity import scene_hash
+from full_geometry.geometry.snapshot import scene_hash
 from full_geometry.objects.objects import refuse_instances, translucent_shapes
-from full_geometry.settings import Settings
+from full_geometry.settings import AUTO, PATH_TRACED, Choices, Settings
 from full_geometry.surface.wrapped import surface_of
 from full_geometry.trade.advice import Advice, advise
-from full_geometry.trade.assessing import CANDIDATES, assess_for, assess_stage
-from full_geometry.trade.contending import DOUBT
-from full_geometry.trade.job import Effort, Job
+from full_geometry.trade.assessing import CANDIDATES, DOUBT, assess_for, assess_stage
 from full_geometry.trade.results import ObjectTrade, TechniqueTrade
 from full_geometry.trade.techniques import (
     GATHERED,
     LAMBERT,
     WALKS,
+    Effort,
+    Job,
     Stage,
     Technique,
 )

@@ -15,10 +15,17 @@ from full_geometry.integrators.translucent_walk import SAMPLES_PER_RAY
 from full_geometry.learning.learners import learners
 from full_geometry.scenes.scene_files import first_cause
 from full_geometry.surface.wrapped import surface_of
-from full_geometry.trade.exits import Exits, visible_exits
-from full_geometry.trade.job import Effort
 from full_geometry.trade.results import Assessment, ObjectTrade, TechniqueTrade
-from full_geometry.trade.sampling import PILOT, Sampled, first_sample, sample_blur, sample_more, warm_up
+from full_geometry.trade.sampling import (
+    PILOT,
+    Exits,
+    Sampled,
+    first_sample,
+    sample_blur,
+    sample_more,
+    visible_exits,
+    warm_up,
+)
 from full_geometry.trade.statistics import (
     Number,
     RadianceEstimate,
@@ -32,7 +39,7 @@ from full_geometry.trade.statistics import (
     seeded,
     with_prior,
 )
-from full_geometry.trade.techniques import GATHERED, PRECOMPUTED, RAYS, WALKS, Stage, Technique
+from full_geometry.trade.techniques import GATHERED, PRECOMPUTED, RAYS, WALKS, Effort, Stage, Technique
 from halfspace_sss.backend import clock
 from halfspace_sss.progress import NamedProgress
 

@@ -26,7 +26,7 @@ class TechniqueTrade:
         way: its name.
         bias2: squared relative error of radiance that no number of samples removes, noise taken out; it may come out
             below 0. Mean over visible exits and channels, over the square of the mean radiance. By a smoothed
-            environment map, where a tolerance is asked, as `ratio` is: see `smoothed_environment`.
+            environment map, where a tolerance is asked, as `ratio` is: see `SmoothedEnvironment`.
         bias2_error: its standard error.
         ratio, ratio_error: mean radiance over that of walks, for each channel, with standard errors.
         variance, variance_error: of one sample without fireflies (`statistics.FIREFLIES`), over the square of the mean

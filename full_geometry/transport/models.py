@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from full_geometry.capabilities import AUTO, PATH_TRACED, Capabilities
+from full_geometry.settings import AUTO, PATH_TRACED, Capabilities
 from halfspace_sss.checks import check_choice
 from halfspace_sss.extensions import TRANSPORTS, offers
 from halfspace_sss.lazy import once
@@ -74,7 +74,7 @@ HALF_SPACE = Capabilities(
 )  # fmt: skip
 MODELS = {
     "full_geometry": ModelEntry(
-        "full_geometry.transport.learnt:learnt_model",
+        "full_geometry.transport.storing:learnt_model",
         Capabilities(straight=True, textures=True, inclusions=True, varying="exact", gathered=True, trained=True),
     ),
     "lambert": ModelEntry(

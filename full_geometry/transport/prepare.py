@@ -9,7 +9,6 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.capabilities import AUTO, Capabilities, Choices
 from full_geometry.geometry.instances import (
     InstanceScene,
     shown_groups,
@@ -39,7 +38,7 @@ from full_geometry.objects.objects import (
     translucent_shapes,
     with_inclusions,
 )
-from full_geometry.settings import AUTOMATIC, Settings
+from full_geometry.settings import AUTO, AUTOMATIC, Capabilities, Choices, Settings
 from full_geometry.surface.medium_derivatives import DifferentiableTransport, MediumDerivatives
 from full_geometry.surface.translucent import MediumSpec, check_boundary
 from full_geometry.surface.varying import equivalent, warn_of_means

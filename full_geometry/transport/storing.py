@@ -17,18 +17,20 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.geometry import mesh
-from full_geometry.geometry.identity import object_digest
-from full_geometry.geometry.points import opaque
+from full_geometry.geometry.points import ObjectModel, PositionSampler, RadialTable, opaque
 from full_geometry.geometry.shape import name_of
-from full_geometry.objects.objects import TranslucentObject, refuse_textures
+from full_geometry.geometry.snapshot import object_digest
+from full_geometry.objects.objects import TranslucentObject, check_geometry, refuse_textures
+from full_geometry.settings import AUTOMATIC, Settings
 from full_geometry.surface.translucent import MediumSpec
 from full_geometry.surface.varying import grid_values
 from full_geometry.surface.wrapped import surface_of
 from full_geometry.transport import any_shape as shapes
 from full_geometry.transport.features import REFLECTIONS, BaseModel, ObjectFrame, n_local, n_pair, n_side, surroundings
+from full_geometry.transport.half_space import HalfSpaceProposals
 from full_geometry.transport.one_object import DirectionalAlbedo, FullGeometry, HalfSpace
-from full_geometry.transport.patches import Patches, PatchSampler
-from halfspace_sss.neural.store import load_weights, save_weights, weights_folder
+from full_geometry.transport.patches import AREA_SHARE, LearntProposals, Patches, PatchSampler, PatchTable
+from halfspace_sss.neural.store import checksum_of, load_weights, save_weights, weights_folder
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import path_of
 from halfspace_sss.registry import bssrdf
@@ -514,3 +516,38 @@ def assemble(
         return Learnt(model, None)
     patches = patches or Patches(obj, frame, arrays[CENTRES].astype(np.float32))
     return Learnt(model, PatchSampler(frame, patches, layers(PATCH_LAYERS)))
+
+
+# --------------------------------------------------------------------------------------------------
+# Binds what was trained of an object: its transport, and entries drawn by patches and probes.
+
+
+FINE = 2.5  # transport mean free paths of the radius of a patch, up to which patches do without probes
+PATCH_SHARE = 0.2  # of the entries where patches are larger: they reach what probes miss
+ENTRIES = 2  # of an exit: its own work is done once, and patches draw without a ray
+
+
+def learnt_model(obj: TranslucentObject, settings: Settings) -> ObjectModel:
+    """Transport and proposals of an object that was trained.
+
+    Raises:
+        ValueError: the object cannot be trained or was not, which says the command that trains it; or weights are
+            damaged.
+    """
+    geometry = obj.geometry
+    check_geometry(geometry)
+    path = find_weights(obj)
+    model, sampler = load(path, obj)
+    backbone = model.base.models
+    transport = replace(model, checksums=(checksum_of(path, KIND), *load_weights(path, KIND)[1][CHECKSUMS]))
+    table = RadialTable([m for m in backbone if float(m.medium.sigma_s) > 0], geometry.size)
+    by_itself = AREA_SHARE if sampler is None else 0.0  # patches reach everywhere
+    share = by_itself if settings.area_share == AUTOMATIC else settings.area_share
+    positions = PositionSampler(replace(geometry, pieces=None), table, obj.points, share)
+    if sampler is None:
+        return ObjectModel(transport, HalfSpaceProposals(positions, backbone[0]))
+    radius = np.sqrt(geometry.area / (np.pi * sampler.patches.n))
+    sigma_t_prime = np.mean([float(m.sigma_t_prime) for m in obj.media])
+    patch_share = 1.0 if radius * sigma_t_prime < FINE else PATCH_SHARE
+    proposals = LearntProposals(sampler, positions, patch_share, geometry.sign, PatchTable(sampler))
+    return ObjectModel(transport, proposals, ENTRIES)

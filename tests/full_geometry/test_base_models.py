@@ -26,8 +26,8 @@ from full_geometry.settings import Settings  # noqa: E402
 from full_geometry.transport import any_shape as shapes  # noqa: E402
 from full_geometry.transport import storing  # noqa: E402
 from full_geometry.transport.exit_pairs import EntryProposals  # noqa: E402
-from full_geometry.transport.learnt import learnt_model  # noqa: E402
 from full_geometry.transport.one_object import HalfSpace  # noqa: E402
+from full_geometry.transport.storing import learnt_model  # noqa: E402
 from halfspace_sss import Medium  # noqa: E402
 from halfspace_sss.neural import store as known_weights  # noqa: E402
 from halfspace_sss.neural.store import load_weights, save_weights  # noqa: E402

@@ -18,8 +18,11 @@ pytest.importorskip("mitsuba")
 pytest.importorskip("torch")
 
 from figures import app as cli  # noqa: E402
-from full_geometry.learning import model_errors, training  # noqa: E402
-from full_geometry.learning import object_learner as command  # noqa: E402
+from full_geometry.learning import (  # noqa: E402
+    learners,  # noqa: E402
+    model_errors,
+    training,
+)
 from full_geometry.learning.network_fitting import Recipe  # noqa: E402
 from full_geometry.objects.objects import object_of  # noqa: E402
 from halfspace_sss.neural import store as known_weights  # noqa: E402
@@ -139,7 +142,7 @@ def test_as_many_exits_are_traced_as_are_asked_for(monkeypatch: Any) -> None:
 @pytest.mark.slow
 def test_all_models_that_take_an_object_are_measured_where_none_is_named(monkeypatch: Any) -> None:
     monkeypatch.setattr(model_errors, "reference", lambda *a: REFERENCE(a[0], 8, 64, *a[3:]))
-    monkeypatch.setattr(command, "errors_of", functools.partial(command.errors_of, walks=64, samples=64))
+    monkeypatch.setattr(learners, "errors_of", functools.partial(learners.errors_of, walks=64, samples=64))
     result = _invoke("errors", "object", "--scene", "ball.xml", "--exits", "8")
     assert result.exit_code == 0, result.output
     measured = set(pandas.read_csv("errors/errors.csv")["model"])

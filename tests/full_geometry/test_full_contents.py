@@ -20,7 +20,7 @@ import full_geometry  # noqa: E402
 from full_geometry.geometry.points import ObjectModel, SurfacePoint, refract_in  # noqa: E402
 from full_geometry.geometry.sensors import camera_rays  # noqa: E402
 from full_geometry.integrators.walk_paths import FirstExits  # noqa: E402
-from full_geometry.learning import object_learner as command  # noqa: E402
+from full_geometry.learning.learners import ObjectLearner  # noqa: E402
 from full_geometry.learning.model_errors import EVEN_SKY, errors_of  # noqa: E402
 from full_geometry.learning.network_fitting import Recipe  # noqa: E402
 from full_geometry.learning.training import Trained, train  # noqa: E402
@@ -239,7 +239,7 @@ REFUSED: dict[str, tuple[Callable[[], dict], str]] = {
 def test_what_cannot_be_learnt_is_refused_by_name_before_anything_is_traced(kind: str) -> None:
     thing, message = REFUSED[kind]
     loaded = mi.load_dict(scene({"thing": thing()}))
-    for ask in (lambda: object_of(loaded, None), lambda: command.untrained(loaded), lambda: render(loaded)):
+    for ask in (lambda: object_of(loaded, None), lambda: ObjectLearner().untrained(loaded), lambda: render(loaded)):
         with pytest.raises(ValueError, match=message):
             ask()
 
@@ -252,10 +252,10 @@ def test_orders_of_objects_with_something_inside_and_objects_in_others_are_refus
     loaded = mi.load_dict(scene(INSIDE["second medium"]()))
     with pytest.raises(ValueError, match="object must be one of wax, got 'seed'"):
         object_of(loaded, None, None, "seed")
-    assert command.untrained(loaded) == ["wax"]
+    assert ObjectLearner().untrained(loaded) == ["wax"]
     for model in ("neural", "better_dipole", "neural_shape"):
         with pytest.raises(ValueError, match=f"empty for the model '{model}', got the shape 'seed' inside"):
-            command.errors(loaded, [model])
+            ObjectLearner().errors(loaded, [model])
 
 
 def test_a_thing_inside_one_of_two_objects_of_one_surface_is_inside_that_one_alone() -> None:
@@ -343,7 +343,7 @@ def test_derivatives_by_a_thing_inside_are_refused_by_name(trained: Trained) -> 
 @pytest.mark.slow
 def test_errors_and_trade_know_the_models_that_take_what_lies_inside(trained: Trained) -> None:
     loaded = untrainable(both())
-    assert {row.model for row in command.errors(loaded, exits=16)} == {"full_geometry"}
+    assert {row.model for row in ObjectLearner().errors(loaded, exits=16)} == {"full_geometry"}
     found = assess(loaded, models=["neural", "full_geometry"], seconds=0.4, flip=False, exits=32).objects[0]
     assert found.way("full_geometry").bias < 0.1 and not found.way("full_geometry").refusal
     assert "must be empty for the model 'neural', got the shape 'stone'" in found.way("neural").refusal

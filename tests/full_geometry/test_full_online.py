@@ -27,10 +27,10 @@ from figures import app as cli  # noqa: E402
 from full_geometry.geometry.points import SurfacePoint  # noqa: E402
 from full_geometry.learning import online, training  # noqa: E402
 from full_geometry.learning.network_fitting import Recipe  # noqa: E402
+from full_geometry.learning.online import combined  # noqa: E402
 from full_geometry.learning.training import CameraSchedule  # noqa: E402
 from full_geometry.objects.objects import object_of  # noqa: E402
 from full_geometry.scenes import camera_walks, reference  # noqa: E402
-from full_geometry.scenes.combined import combined  # noqa: E402
 from full_geometry.scenes.reference_store import Reference  # noqa: E402
 from full_geometry.scenes.scene_files import open_scene  # noqa: E402
 from full_geometry.transport.exit_pairs import trace_exits  # noqa: E402

@@ -12,9 +12,12 @@ mi = pytest.importorskip("mitsuba")
 pytest.importorskip("igl")
 
 from full_geometry.geometry.points import SurfacePoint, cosine_direction  # noqa: E402
-from full_geometry.learning.meshes import Box, surface  # noqa: E402
+from full_geometry.learning.meshes import (  # noqa: E402
+    Box,
+    make_shape,  # noqa: E402
+    surface,
+)
 from full_geometry.learning.model_errors import errors_of, transport_of  # noqa: E402
-from full_geometry.learning.shapes import make_shape  # noqa: E402
 from full_geometry.objects.objects import TranslucentObject, object_of  # noqa: E402
 from full_geometry.transport.any_shape import Backbone, NeuralShape, most, transport  # noqa: E402
 from full_geometry.transport.descriptors import (  # noqa: E402

@@ -16,18 +16,19 @@ torch = pytest.importorskip("torch")
 from benchmarks.held_out import HELD_OUT  # noqa: E402
 from figures import app as cli  # noqa: E402
 from full_geometry.learning import shape_training as training  # noqa: E402
-from full_geometry.learning.shape_data import (  # noqa: E402  # noqa: E402
+from full_geometry.learning.meshes import TRAINING, make_shape  # noqa: E402
+from full_geometry.learning.shape_training import (  # noqa: E402  # noqa: E402  # noqa: E402
     GROUPS,
     GroupedPairs,
     PairData,
+    ShapeFit,
+    ShapeRecipe,
     draw_medium,
     draw_object,
     grouped,
     make_data,
     mean_events,
 )
-from full_geometry.learning.shape_training import ShapeFit, ShapeRecipe  # noqa: E402
-from full_geometry.learning.shapes import TRAINING, make_shape  # noqa: E402
 from full_geometry.transport.any_shape import ALBEDO, ETA, SIZE, WEIGHTS, G, load, shipped_weights  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("mono")

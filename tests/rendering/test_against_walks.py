@@ -28,7 +28,7 @@ KETCHUP = {"material": "ketchup", "model": "neural"}
 
 
 def _ratio(image: np.ndarray, scene: Any) -> Any:
-    from full_geometry.scenes.against_walks import mean_ratios
+    from full_geometry.learning.model_errors import mean_ratios
 
     (found,) = mean_ratios(scene, image)
     return found
@@ -43,7 +43,7 @@ def test_an_image_by_walks_has_the_light_of_walks() -> None:
 
 
 def test_a_half_space_on_a_small_ball_is_told_to_be_off() -> None:
-    from full_geometry.scenes.against_walks import told
+    from full_geometry.learning.model_errors import told
 
     scene = mi.load_dict(_scene(KETCHUP, type="bssrdf", mm_per_unit=5.0))
     image = np.array(mi.render(scene, spp=64))

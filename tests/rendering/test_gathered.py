@@ -10,8 +10,7 @@ import pytest
 
 from full_geometry.geometry.shape import analyse_shape
 from full_geometry.integrators.gathering import _steadied, _stratified
-from full_geometry.learning.meshes import Box, surface
-from full_geometry.learning.shapes import box
+from full_geometry.learning.meshes import Box, box, surface
 from full_geometry.precomputed.entries import StratifiedEntries
 from full_geometry.precomputed.point_pairs import Rays, lit_pairs
 from full_geometry.precomputed.transport_matrix import Incident, RowUniforms

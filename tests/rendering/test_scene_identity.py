@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import halfspace_sss
-from full_geometry.geometry.identity import object_digest, scene_hash
+from full_geometry.geometry.snapshot import object_digest, scene_hash
 from full_geometry.scenes.reference import learnt
 from full_geometry.scenes.scene_files import load_scene
 from halfspace_sss.neural import universal
@@ -40,7 +40,7 @@ import sys
 import full_geometry
 import mitsuba as mi
 from full_geometry.scenes.scene_files import load_scene
-from full_geometry.geometry.identity import scene_hash
+from full_geometry.geometry.snapshot import scene_hash
 mi.set_variant("llvm_ad_rgb")
 full_geometry.register()
 scene = load_scene(sys.argv[1])

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 import full_geometry.geometry.shape as shape_module
-from full_geometry.geometry.identity import scene_hash
 from full_geometry.geometry.shape import SceneMark
-from full_geometry.geometry.snapshot import Snapshot
+from full_geometry.geometry.snapshot import Snapshot, scene_hash
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

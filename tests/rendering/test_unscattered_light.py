@@ -124,7 +124,7 @@ def _mesh(name: str, folder: Path) -> dict:
     """A bowl, open towards the camera, a ring or a hand, about 10 units wide, without interpolated normals."""
     meshes, shapes = (
         pytest.importorskip("full_geometry.learning.meshes"),
-        pytest.importorskip("full_geometry.learning.shapes"),
+        pytest.importorskip("full_geometry.learning.meshes"),
     )
     hands = pytest.importorskip("benchmarks.hand_and_ribbon")
     pytest.importorskip("igl")

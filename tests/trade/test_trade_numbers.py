@@ -12,9 +12,8 @@ from full_geometry.cli import trade
 from full_geometry.integrators.gathering import PART, Gathered, Gathering
 from full_geometry.trade import recommend
 from full_geometry.trade.advice import advise
+from full_geometry.trade.assessing import contenders, left_out, most_promising
 from full_geometry.trade.automatic import picked, walks_of
-from full_geometry.trade.contending import contenders, left_out, most_promising
-from full_geometry.trade.job import Job
 from full_geometry.trade.results import Assessment, ObjectTrade, TechniqueTrade, samples_for
 from full_geometry.trade.statistics import (
     FIREFLIES,
@@ -26,7 +25,7 @@ from full_geometry.trade.statistics import (
     relative_variance,
     with_prior,
 )
-from full_geometry.trade.techniques import Technique
+from full_geometry.trade.techniques import Job, Technique
 
 SEEDS, EXITS, SAMPLES = 400, 48, 12
 

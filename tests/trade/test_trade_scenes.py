@@ -14,11 +14,9 @@ from typer.testing import CliRunner
 from figures import app as cli
 from full_geometry.trade import assess, automatic, flat, measuring, recommend, sampling
 from full_geometry.trade.assessing import assess_stage
-from full_geometry.trade.exits import visible_exits
 from full_geometry.trade.images import small_images
-from full_geometry.trade.job import Effort, Job
-from full_geometry.trade.sampling import first_sample, sample_more
-from full_geometry.trade.techniques import PRECOMPUTED_WALKS, WALKS, Technique, stage
+from full_geometry.trade.sampling import first_sample, sample_more, visible_exits
+from full_geometry.trade.techniques import PRECOMPUTED_WALKS, WALKS, Effort, Job, Technique, stage
 from full_geometry.transport.models import model_names
 from halfspace_sss import Medium
 from halfspace_sss.physics.fresnel import F_r
@@ -213,7 +211,7 @@ def test_the_second_look_goes_on_with_the_samples_of_the_first_and_tells_biases_
 
 
 def test_soft_light_keeps_the_mean_and_the_first_moment_of_an_environment() -> None:
-    from full_geometry.trade.smoothed_environment import smoothed
+    from full_geometry.trade.techniques import smoothed
 
     own = np.concatenate([windows()[:, -1:], windows(), windows()[:, :1]], axis=1)
     theta, phi = np.linspace(0, np.pi, 32)[:, None], (np.arange(64) + 0.5) * np.pi / 32
@@ -224,7 +222,7 @@ def test_soft_light_keeps_the_mean_and_the_first_moment_of_an_environment() -> N
 
 
 def test_a_point_through_which_a_lamp_would_be_seen_is_left_out() -> None:
-    from full_geometry.trade.exits import visible_exits
+    from full_geometry.trade.sampling import visible_exits
     from full_geometry.trade.techniques import stage
 
     lit = scene({"sigma_s": 9.5, "sigma_a": 0.5, "eta": 1.0})
