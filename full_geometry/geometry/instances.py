@@ -363,10 +363,7 @@ def bounds_of(shapes: Sequence[mi.Shape], shown: Sequence[Group] = ()) -> mi.Flo
     known = {id(shape): bound_of(shape) for shape in shapes}
     for group in shown:
         known |= {id(each): e for each, e in zip(group.instances, group.rounding)}
-    numbers = pointer_numbers(mi.ShapePtr(shape) for shape in shapes)
-    table = np.zeros(max(numbers) + 1)
-    table[numbers] = [known[id(shape)] for shape in shapes]
-    result = mi.Float(table.tolist())
+    result = by_pointer([mi.ShapePtr(shape) for shape in shapes], [known[id(shape)] for shape in shapes], 0.0)
     dr.make_opaque(result)
     return result
 
@@ -376,10 +373,8 @@ def lamps_of(scene: mi.Scene) -> mi.Float | None:
     emitters = scene.emitters()
     if not len(emitters):
         return None
-    numbers = pointer_numbers(mi.EmitterPtr(emitter) for emitter in emitters)
-    table = np.zeros(max(numbers) + 1)
-    table[numbers] = [0.0 if e.get_shape() is None else bound_of(e.get_shape()) for e in emitters]
-    result = mi.Float(table.tolist())
+    values = [0.0 if e.get_shape() is None else bound_of(e.get_shape()) for e in emitters]
+    result = by_pointer([mi.EmitterPtr(emitter) for emitter in emitters], values, 0.0)
     dr.make_opaque(result)
     return result
 

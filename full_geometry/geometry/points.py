@@ -311,7 +311,7 @@ class Proposals(Protocol):
         return self
 
     def prepare(self, out: SurfacePoint, prepared: Any, active: mi.Bool) -> Any:
-        """Prepare an exit once for all its entries; `prepared` comes from `Transport.prepare`."""
+        """Prepare an exit once for all its entries, if need be; `prepared` comes from `Transport.prepare`."""
 
     def sample(
         self, out: SurfacePoint, prim_index: mi.UInt32, prepared: Any, sampler: mi.Sampler, active: mi.Bool
@@ -362,12 +362,13 @@ class Transport(Protocol):
     """
 
     orders: str
-    checksums: tuple[str, ...]
-    alpha: ObjectAlbedo | None
-    is_delta: bool
+    checksums: tuple[str, ...] = ()
+    alpha: ObjectAlbedo | None = None
+    is_delta: bool = False
 
     def prepare(self, at: SurfacePoint, active: mi.Bool = True) -> Any:
-        """Prepare an exit once for all its entries; the result is handed to `S`."""
+        """Prepare an exit once for all its entries; the result, by default the exit, is handed to `S`."""
+        return at
 
     def S(self, exit: Any, at: SurfacePoint, active: mi.Bool = True) -> mi.Spectrum:
         """S(x_i, w_i; x_o, w_o) per channel, 1/((scene unit)² sr); 0 below the horizons.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -506,12 +506,13 @@ def _by_optix() -> bool:
     return mi.variant().startswith("cuda")
 
 
-def by_pointer(pointers: list[Pointer], values: np.ndarray, otherwise: int) -> mi.Int32:
-    """Table from the number of a pointer in Dr.Jit's registry to a value."""
-    ids = pointer_numbers(pointers)
-    table = np.full(max(ids, default=0) + 1, otherwise, dtype=np.int32)
+def by_pointer(pointers: Iterable[Pointer], values: Sequence[float], otherwise: float) -> mi.Int32 | mi.Float:
+    """Table from the number of a pointer in Dr.Jit's registry to a whole number, or to a real one."""
+    ids, whole = pointer_numbers(pointers), isinstance(otherwise, int)
+    table = np.full(max(ids, default=0) + 1, otherwise)
     table[ids] = values
-    return mi.Int32(table.tolist())  # lists, not NumPy arrays: memory in any alignment would need kernels of its own
+    # lists, not NumPy arrays: memory in any alignment would need kernels of its own
+    return (mi.Int32 if whole else mi.Float)(table.tolist())
 
 
 def pointer_numbers(pointers: Iterable[Pointer]) -> list[int]:

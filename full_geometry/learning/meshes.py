@@ -124,9 +124,9 @@ def ridges(p: np.ndarray, seed: int, octaves: int = 2) -> np.ndarray:
     return np.clip(1 - np.abs(fbm(p, seed, octaves)), 0, 1)
 
 
-def ring_noise(angle: np.ndarray, seed: int, waves: int = 4) -> np.ndarray:
-    """Smooth periodic noise of an angle (radians) in [-1, 1]: the first `waves` harmonics with random phase."""
-    rng = np.random.default_rng([seed, 11])
+def ring_noise(angle: np.ndarray, seed: int) -> np.ndarray:
+    """Smooth periodic noise of an angle (radians) in [-1, 1]: the first four harmonics with random phase."""
+    rng, waves = np.random.default_rng([seed, 11]), 4
     amplitude, phase = rng.uniform(0.4, 1, waves) / np.arange(1, waves + 1), rng.uniform(0, 2 * np.pi, waves)
     harmonics = (a * np.sin((k + 1) * angle + c) for k, (a, c) in enumerate(zip(amplitude, phase)))
     return sum(harmonics) / amplitude.sum()
@@ -339,10 +339,10 @@ Made = tuple[Distance, Box]
 Family = Callable[[np.random.Generator], Made]
 
 
-def margin(low: np.ndarray, high: np.ndarray, part: float = 0.06) -> Box:
-    """The box from low to high with a margin, a part of its longest side."""
+def margin(low: np.ndarray, high: np.ndarray) -> Box:
+    """The box from low to high with a margin of 6 % of its longest side."""
     low, high = np.asarray(low, float), np.asarray(high, float)
-    wide = part * float((high - low).max())
+    wide = 0.06 * float((high - low).max())
     return Box(tuple((low - wide).tolist()), tuple((high + wide).tolist()))
 
 

@@ -77,7 +77,22 @@ class DenseLayers(nn.Module):
         return arrays
 
 
-class Correction(nn.Module):
+class NamedNetwork(nn.Module):
+    """A network of dense layers, whose matrices (outputs, inputs) and biases have names in files."""
+
+    NAMES: tuple[str, str]
+    layers: DenseLayers
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Matrices and biases by name."""
+        return self.layers.arrays(*self.NAMES)
+
+    def take(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Take the numbers that `arrays` gave."""
+        self.layers.take(arrays, *self.NAMES)
+
+
+class Correction(NamedNetwork):
     """f = 6 tanh(g/6) per channel, g a perceptron; 0 initially.
 
     Args:
@@ -86,6 +101,8 @@ class Correction(nn.Module):
         width, depth: hidden layers.
         seed: of the initial weights.
     """
+
+    NAMES = ("W", "b")
 
     def __init__(self, n_in: int, channels: int, width: int = 64, depth: int = 3, seed: int = 0) -> None:
         super().__init__()
@@ -100,14 +117,6 @@ class Correction(nn.Module):
         first = self.layers.matrices[0][:, self.order] * self.signs if back else None
         return BOUND * torch.tanh(self.layers(x, first) / BOUND)
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Matrices (outputs, inputs) and biases by name."""
-        return self.layers.arrays("W", "b")
-
-    def take(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """The numbers that `arrays` gave."""
-        self.layers.take(arrays, "W", "b")
-
 
 def likelihood(walks: tuple, proposals: tuple, kept: float) -> torch.Tensor:
     """E_q[(S_0 mu_i / q) exp f] - E_walks[T f], sum over channels.
@@ -121,7 +130,7 @@ def likelihood(walks: tuple, proposals: tuple, kept: float) -> torch.Tensor:
     return ((W * torch.exp(g)).mean(dim=1) - kept * (T * f).mean(dim=1)).sum()
 
 
-class AlbedoNetwork(nn.Module):
+class AlbedoNetwork(NamedNetwork):
     """F_t P sigmoid(a) of orders one, then two and more, per channel, a a perceptron of the exit.
 
     Args:
@@ -131,6 +140,8 @@ class AlbedoNetwork(nn.Module):
         eta: relative index.
         seed: of the initial weights.
     """
+
+    NAMES = ("A", "a")
 
     def __init__(self, n_in: int, channels: int, hidden: tuple[int, ...], eta: float, seed: int = 0) -> None:
         super().__init__()
@@ -169,14 +180,6 @@ class AlbedoNetwork(nn.Module):
         units = self.layers.units(torch.cat([exit, entry], dim=1)).split(lanes, dim=1)
         return torch.cat([exit, units[0], entry, units[1], pair])
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Matrices (outputs, inputs) and biases by name."""
-        return self.layers.arrays("A", "a")
-
-    def take(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """The numbers that `arrays` gave."""
-        self.layers.take(arrays, "A", "a")
-
 
 def mean_likelihood(both: tuple, T: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
     """E[alpha - T log alpha] over walks, sum over channels times their scale; its minimum is alpha = E[T | exit].
@@ -190,8 +193,8 @@ def mean_likelihood(both: tuple, T: torch.Tensor, scale: torch.Tensor) -> torch.
     return (scale * (alpha - T * log_alpha)).mean(dim=1).sum()
 
 
-class PatchLogits(nn.Module):
-    """log p(patch | exit) up to a constant; initially the shares of the area.
+class PatchLogits(NamedNetwork):
+    """log p(patch | exit) up to a constant; initially the shares of the area, which its arrays are without.
 
     Args:
         n_in: features of an exit.
@@ -199,6 +202,8 @@ class PatchLogits(nn.Module):
         hidden: widths of the hidden layers.
         seed: of the initial weights.
     """
+
+    NAMES = ("V", "c")
 
     def __init__(self, n_in: int, areas: np.ndarray, hidden: tuple[int, ...], seed: int = 0) -> None:
         super().__init__()
@@ -208,14 +213,6 @@ class PatchLogits(nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return self.layers(x) + self.log_share
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Matrices (outputs, inputs) and biases by name, without the shares of the area."""
-        return self.layers.arrays("V", "c")
-
-    def take(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """The numbers that `arrays` gave."""
-        self.layers.take(arrays, "V", "c")
 
 
 def patch_likelihood(logits: torch.Tensor, T: torch.Tensor, patch: torch.Tensor) -> torch.Tensor:

@@ -138,12 +138,11 @@ class ShapeFit:
     Args:
         recipe: sizes and rates.
         seed: of the initial weights.
-        network: another network to fit, for comparisons.
     """
 
-    def __init__(self, recipe: ShapeRecipe, seed: int, network: nn.Module | None = None) -> None:
+    def __init__(self, recipe: ShapeRecipe, seed: int) -> None:
         self.recipe = recipe
-        self.network = network or ShapeNetwork(recipe, seed)
+        self.network = ShapeNetwork(recipe, seed)
         self.descent = Descent(self.network, average=AVERAGE)
         self.average: nn.Module = self.descent.average
 
@@ -250,15 +249,6 @@ def train_shapes(
             check_folder(place)
     run = _ShapeTraining(recipe, int(seed), [Path(m) for m in meshes], Path(work) if work else None)
     return run.go(Path(folder), seconds, plan, progress)
-
-
-def make_objects(
-    seed: int, first: int, last: int, meshes: Sequence[str | Path], work: str | Path, recipe: ShapeRecipe = STANDARD
-) -> None:
-    """Make the data of objects ahead, as another process: a run with the same seed, meshes and work takes them over."""
-    run = _ShapeTraining(recipe, seed, [Path(m) for m in meshes], Path(work))
-    for k in range(first, last):
-        run.object(k)
 
 
 class _ShapeTraining:

@@ -14,14 +14,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.trade.assessing import assess, once
 from full_geometry.trade.results import UNNAMED, Assessment, ObjectTrade, TechniqueTrade, html_table, samples_for
 from full_geometry.trade.techniques import GATHERED, LAMBERT, PRECOMPUTED_WALKS, Job, Technique
 from halfspace_sss.noise_free import short
-from halfspace_sss.physics.medium import Medium
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 INTEGRATOR = "bssrdf"
 DARK = "no light comes from it, every way shows it black"
@@ -90,23 +93,21 @@ class Advice:
 
 
 def recommend(
-    scene: Any = None,
+    scene: mi.Scene | dict[str, Any] | str | Path | Assessment,
     *,
-    medium: Medium | None = None,
-    r: tuple[float, float] | None = None,
     tolerance: float = 0.05,
     images: int = 1,
     seconds: float | None = None,
     count_training: bool = True,
     seed: int = 0,
     **assessing: Any,
-) -> Any:
+) -> Advice:
     """The cheapest way of rendering a scene that keeps a tolerance, with a sentence on every other one.
+
+    For curves of a medium see `flat.recommend_flat`.
 
     Args:
         scene: as in `assess`, or an `Assessment` that has been made.
-        medium: instead of a scene: the model of the half-space for curves, see `flat.recommend_flat`.
-        r: smallest and largest distance of a medium, mm.
         tolerance: relative error of radiance over the visible points of an object, bias and noise together.
         images: how many are to be rendered; preparation and training count once.
         seconds: that the whole job may take; if no way keeps the tolerance then, that with the least error is named.
@@ -115,18 +116,9 @@ def recommend(
         assessing: what else `assess` takes; its `seconds` is called `assess_seconds` here.
 
     Raises:
-        ValueError: an argument is out of range, scene and medium are both given or neither is, or the scene cannot be
-            rendered.
+        ValueError: an argument is out of range, or the scene cannot be rendered.
     """
     job = Job(tolerance, images, seconds, count_training)
-    if (scene is None) == (medium is None):
-        raise ValueError("one of scene and medium must be given, got both" if medium else "a scene must be given")
-    if medium is not None:
-        from full_geometry.trade.flat import recommend_flat
-
-        return recommend_flat(medium, r, tolerance=tolerance, seed=seed, **assessing)
-    if r is not None:
-        raise ValueError(f"r must be left out with a scene, got {r!r}")
     if isinstance(scene, Assessment):
         return advise(scene, job)
     if "assess_seconds" in assessing:

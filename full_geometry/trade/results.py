@@ -93,12 +93,12 @@ class TechniqueTrade:
         return self.variance / noise**2 * self.seconds
 
 
-def samples_for(row: TechniqueTrade, tolerance: float, z: float = DOUBT) -> float:
-    """Samples n of a pixel by which bias² + variance / n and z of its standard errors are at tolerance²; inf for none.
+def samples_for(row: TechniqueTrade, tolerance: float) -> float:
+    """Samples n of a pixel by which bias² + variance / n and z = DOUBT of its standard errors are at tolerance²; inf for none.
 
     With a = tolerance² - bias² the smaller root of (a - V / n)² = z² (s² + (v / n)²).
     """
-    a, s, v = tolerance**2 - max(row.bias2, 0.0), z * row.bias2_error, z * row.variance_error
+    a, s, v = tolerance**2 - max(row.bias2, 0.0), DOUBT * row.bias2_error, DOUBT * row.variance_error
     if not a > s:
         return math.inf
     V = row.variance

@@ -169,9 +169,9 @@ def noise_of_parts(parts: tuple[RadianceEstimate, RadianceEstimate], b: Radiance
     return Number(max(found.value, 0.0), found.error)
 
 
-def with_prior(found: Number, error: float, doubt: float = 2.0) -> Number:
-    """With 0 ± `error` that was known before, by weights 1 / error²; alone where it is `doubt` of its errors off."""
-    if not abs(found.value) < doubt * found.error:
+def with_prior(found: Number, error: float) -> Number:
+    """With 0 ± `error` that was known before, by weights 1 / error²; alone where it is two of its errors off."""
+    if not abs(found.value) < 2 * found.error:
         return found
     share = error**2 / (error**2 + found.error**2)
     return Number(share * found.value, found.error * share**0.5)

@@ -25,6 +25,7 @@ from full_geometry.geometry.points import (
     PositionSampler,
     RadialTable,
     SurfacePoint,
+    Transport,
     evaluate,
     opaque,
     refract_in,
@@ -147,7 +148,7 @@ PLACE_OF_G = 2  # among the numbers of a medium
 
 
 @dataclass(frozen=True, eq=False)
-class NeuralShape:
+class NeuralShape(Transport):
     """S = s S_0 P_o P_i exp f, f = b tanh(h . tanh(u) / b), b = 1.5 to 3 above 0, see `most`, and 6 below.
 
     u = (c_o + c_i, c_oi) is what is 0 on a plane, h a perceptron whose first layer is asked for both ends in turn and
@@ -172,8 +173,6 @@ class NeuralShape:
     checksums: tuple[str, ...] = ()
     precise: bool = False
     orders = "multiple"
-    alpha = None
-    is_delta = False
 
     @classmethod
     def of(cls, obj: TranslucentObject, weights: Mapping[str, np.ndarray], precise: bool = False) -> NeuralShape:

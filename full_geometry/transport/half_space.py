@@ -15,8 +15,10 @@ from full_geometry.geometry.points import (
     EntrySample,
     ObjectModel,
     PositionSampler,
+    Proposals,
     RadialTable,
     SurfacePoint,
+    Transport,
     local_frame,
     opaque,
     opposed,
@@ -36,7 +38,7 @@ POINTS_PER_RATIO, MOST_POINTS = 60.0, 9  # candidates over the area
 
 
 @dataclass(frozen=True, eq=False)
-class HalfSpaceTransport:
+class HalfSpaceTransport(Transport):
     """S of the half-space at the distance of two surface points, see `plane_query`.
 
     Args:
@@ -48,8 +50,6 @@ class HalfSpaceTransport:
     models: list[BSSRDF]
     geometry: str = "distance"
     precise: bool = False
-    alpha = None
-    is_delta = False
 
     @property
     def orders(self) -> str:
@@ -59,12 +59,7 @@ class HalfSpaceTransport:
     def checksums(self) -> tuple[str, ...]:
         return tuple(checksum for model in self.models for checksum in model.checksums)
 
-    def prepare(self, at: SurfacePoint, active: mi.Bool = True) -> SurfacePoint:
-        """Nothing is done for the exit alone."""
-        return at
-
     def S(self, exit: SurfacePoint, at: SurfacePoint, active: mi.Bool = True) -> mi.Spectrum:
-        """See `Transport`."""
         query = plane_query(at, exit, self.geometry)
         above = active & (at.mu > 0) & (query[3] > 0)
         asked = in_double(query) if self.precise else query
@@ -86,7 +81,7 @@ def in_double(query: tuple) -> tuple:
 
 
 @dataclass(frozen=True, eq=False)
-class HalfSpaceProposals:
+class HalfSpaceProposals(Proposals):
     """Points by probes and over the area, directions by a model.
 
     Args:
@@ -102,9 +97,6 @@ class HalfSpaceProposals:
     def lit(self, brightness: np.ndarray) -> HalfSpaceProposals:
         """With more points where faces are bright."""
         return replace(self, positions=replace(self.positions, points=self.positions.points.lit(brightness)))
-
-    def prepare(self, out: SurfacePoint, prepared: Any, active: mi.Bool) -> None:
-        """Nothing is done for the exit alone."""
 
     def sample(
         self, out: SurfacePoint, prim_index: mi.UInt32, prepared: None, sampler: mi.Sampler, active: mi.Bool

@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.geometry.points import SurfacePoint, opaque, plane_query
+from full_geometry.geometry.points import SurfacePoint, Transport, opaque, plane_query
 from full_geometry.objects.objects import TranslucentObject
 from full_geometry.transport.features import (
     BaseModel,
@@ -171,7 +171,7 @@ BOUND = 6.0  # of f: where walks leave but no proposal comes, nothing else would
 
 
 @dataclass(frozen=True, eq=False)
-class FullGeometry:
+class FullGeometry(Transport):
     """S = S_0 exp f, f = 6 tanh((g + h_o + h_i)/6), g a perceptron of the features of exit, entry and pair, and of
     what alpha's makes of exit and entry, h a quadratic function of those of one end.
 
@@ -193,7 +193,6 @@ class FullGeometry:
     alpha: DirectionalAlbedo
     checksums: tuple[str, ...] = ()
     orders = "multiple"
-    is_delta = False
 
     @functools.cached_property
     def _network(self) -> Perceptron:
@@ -227,8 +226,7 @@ class FullGeometry:
         S_0 = self.base(exit.side, entry, active)
         return dr.select(active, S_0 * dr.exp(BOUND * dr.tanh(f / BOUND)), 0)
 
-    def paint(self, at: SurfacePoint) -> Any:
-        """See `geometry.points.Transport`."""
+    def paint(self, at: SurfacePoint) -> mi.Spectrum:
         return self.base.palette.reflectance(at.medium.albedo)
 
     def _end(self, side: Side) -> tuple[list[Any], list[Any]]:

@@ -43,6 +43,7 @@ from full_geometry.geometry.points import (
     ObjectModel,
     PositionSampler,
     SurfacePoint,
+    Transport,
     opaque,
     plane_query,
 )
@@ -432,7 +433,7 @@ def _albedo_of_v(v: Any, g: Any, c: Any) -> Any:
 
 
 @dataclass(frozen=True, eq=False)
-class PaletteTransport:
+class PaletteTransport(Transport):
     """S = sqrt(S_o S_i) of the media at both ends, or S of that at the wavelengths of a ray.
 
     Args:
@@ -446,8 +447,6 @@ class PaletteTransport:
     obj: Geometry
     medium: Varied
     geometry: str = "distance"
-    alpha = None
-    is_delta = False
 
     @property
     def orders(self) -> str:
@@ -460,12 +459,7 @@ class PaletteTransport:
             return (models[0].trained,)
         return tuple(checksum for model in models for checksum in model.checksums)
 
-    def prepare(self, at: SurfacePoint, active: mi.Bool = True) -> SurfacePoint:
-        """Nothing is done for the exit alone."""
-        return at
-
     def S(self, exit: SurfacePoint, at: SurfacePoint, active: mi.Bool = True) -> mi.Spectrum:
-        """See `Transport`."""
         with dr.suspend_grad():
             query = plane_query(at, exit, self.geometry)
             above = active & (at.mu > 0) & (query[3] > 0)
@@ -473,7 +467,6 @@ class PaletteTransport:
         return dr.select(above, self.palette.S(ends, query, above), 0)
 
     def paint(self, at: SurfacePoint) -> mi.Spectrum:
-        """See `Transport`."""
         return self.palette.reflectance(at.medium.albedo)
 
 

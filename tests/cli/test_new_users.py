@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 import halfspace_sss as sss
 from figures import app as cli
-from full_geometry.trade import recommend
+from full_geometry.trade import recommend_flat
 from halfspace_sss.provenance import read_text
 
 MEDIUM = sss.Medium.from_albedo(0.75, 0.241)
@@ -91,7 +91,7 @@ def test_errors_of_reflectance_are_those_of_the_series(curve_set) -> None:
 
 
 def test_objects_show_medium_and_unit_in_a_line(curve_set) -> None:
-    advice = recommend(medium=MEDIUM, tolerance=0.5, events=1e5, models=["better_dipole"])
+    advice = recommend_flat(MEDIUM, tolerance=0.5, events=1e5, models=["better_dipole"])
     trace = sss.trace(MEDIUM, 0.5, n_paths=1000)
     for found in (sss.bssrdf("neural", MEDIUM), trace, curve_set, advice):
         assert "\n" not in repr(found) and len(repr(found)) < 200

@@ -17,7 +17,7 @@ from benchmarks.held_out import HELD_OUT  # noqa: E402
 from figures import app as cli  # noqa: E402
 from full_geometry.learning import shape_training as training  # noqa: E402
 from full_geometry.learning.meshes import TRAINING, make_shape  # noqa: E402
-from full_geometry.learning.shape_training import (  # noqa: E402  # noqa: E402  # noqa: E402
+from full_geometry.learning.shape_training import (  # noqa: E402
     GROUPS,
     GroupedPairs,
     PairData,

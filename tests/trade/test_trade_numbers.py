@@ -310,17 +310,11 @@ def test_a_record_comes_back_as_it_was() -> None:
         ({"tolerance": 0.0}, "tolerance must be a number in"),
         ({"images": 0}, "images must be a whole number >= 1"),
         ({"seconds": -1.0}, "seconds must be a number in"),
-        ({"r": (1.0, 2.0)}, "r must be left out with a scene"),
     ],
 )
 def test_bad_input_is_refused(given: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         recommend(_assessment(GOOD), **given)
-
-
-def test_a_scene_or_a_medium_must_be_given() -> None:
-    with pytest.raises(ValueError, match="a scene must be given"):
-        recommend()
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from render_files import XML
 from typer.testing import CliRunner
 
 from figures import app as cli
-from full_geometry.trade import assess, automatic, flat, measuring, recommend, sampling
+from full_geometry.trade import assess, automatic, flat, measuring, recommend, recommend_flat, sampling
 from full_geometry.trade.assessing import assess_stage
 from full_geometry.trade.images import small_images
 from full_geometry.trade.sampling import first_sample, sample_more, visible_exits
@@ -418,7 +418,7 @@ def test_objects_without_weights_are_learnt_before_and_refusals_are_heard(monkey
 
 def test_a_medium_without_a_scene_gets_a_model_of_the_half_space() -> None:
     medium = Medium.from_albedo(0.75, 0.241, 0.0, 1.3)
-    found = recommend(medium=medium, r=(1.0, 40.0), tolerance=0.2, events=2e5, models=["better_dipole", "neural"])
+    found = recommend_flat(medium, r=(1.0, 40.0), tolerance=0.2, events=2e5, models=["better_dipole", "neural"])
     assert found.model == "neural"
     assert [option.model for option in found.options] == ["neural", "path_traced", "better_dipole"]
     assert found.options[-1].why.endswith("asked 20 %")
@@ -448,7 +448,7 @@ def test_the_command_writes_what_it_says_of_a_material(tmp_path: Path, monkeypat
 )
 def test_a_medium_or_a_range_without_light_is_refused(medium: tuple, r: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        recommend(medium=Medium(*medium), r=r)
+        recommend_flat(Medium(*medium), r)
 
 
 def test_without_an_argument_the_shipped_table_is_shown() -> None:
