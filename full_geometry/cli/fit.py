@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -173,7 +174,7 @@ def scene_with_medium(scene: Path, name: str | None, found: MaterialFit, painted
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
-def _add_numbers(surface: ElementTree.Element, key: str, values: Any) -> None:
+def _add_numbers(surface: ElementTree.Element, key: str, values: Iterable[float]) -> None:
     ElementTree.SubElement(surface, "string", name=key, value=", ".join(repr(float(v)) for v in values))
 
 

@@ -14,6 +14,7 @@ from full_geometry.cli.variants import Drawers, use_mitsuba
 from halfspace_sss.cli import shared
 
 if TYPE_CHECKING:
+    import mitsuba as mi
     import numpy as np
 
     from full_geometry.scenes.reference import Limits
@@ -146,7 +147,7 @@ def render(
     shared.say(*(loaded.integrator().gathered if is_bssrdf(loaded.integrator()) else ()))
 
 
-def _off(scene: Any, image: np.ndarray, sensor: int, model: str | None) -> list[str]:
+def _off(scene: mi.Scene, image: np.ndarray, sensor: int, model: str | None) -> list[str]:
     """How far off models are on each object of an image, where walks can tell."""
     import mitsuba as mi
 
@@ -161,7 +162,7 @@ def _off(scene: Any, image: np.ndarray, sensor: int, model: str | None) -> list[
         return [f"how far models are off is not known, as random walks refuse the scene: {first_cause(error)}"]
 
 
-def _opened(scene: Path, transport: TransportOptions, parameters: dict[str, str], denoise: bool) -> Any:
+def _opened(scene: Path, transport: TransportOptions, parameters: dict[str, str], denoise: bool) -> mi.Scene:
     """The scene; where all models are "auto" by walks, if these are the cheapest that keep the tolerance."""
     import mitsuba as mi
 
@@ -182,7 +183,7 @@ def _opened(scene: Path, transport: TransportOptions, parameters: dict[str, str]
     return open_scene(scene, PATH_TRACED, transport.orders, parameters, {**settings, "light": light})
 
 
-def _sensors(text: str, scene: Any) -> list[int]:
+def _sensors(text: str, scene: mi.Scene) -> list[int]:
     """The numbers of the sensors that are asked for, each once; ValueError if the scene lacks one."""
     from full_geometry.scenes.reference import check_sensor
 
@@ -212,7 +213,7 @@ def _unfinished(file: Path) -> Path:
     return file.with_suffix(".unfinished.exr")
 
 
-def _rendered(scene: Any, file: Path, limits: Limits, which: dict[str, Any], resume: bool) -> Reference:
+def _rendered(scene: mi.Scene, file: Path, limits: Limits, which: dict[str, Any], resume: bool) -> Reference:
     """The render, in files of another name until it is done."""
     from full_geometry.learning import online
     from full_geometry.scenes.scene_files import first_cause
@@ -239,7 +240,7 @@ class _Bars:
     def __enter__(self) -> _Bars:
         return self
 
-    def __exit__(self, *error: Any) -> None:
+    def __exit__(self, *error: object) -> None:
         self.bar.__exit__(*error)
 
     def callbacks(self) -> dict[str, Any]:

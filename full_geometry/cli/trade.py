@@ -89,7 +89,7 @@ def trade(
         _material(what, how, out)
 
 
-def _check_left_out(beside: str, **options: Any) -> None:
+def _check_left_out(beside: str, **options: object) -> None:
     """ValueError if one of the options was given where `beside` says that it has no place."""
     for name, value in options.items():
         if value not in (None, []):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -70,13 +70,13 @@ def _hear_warnings() -> None:
         def __init__(self) -> None:
             mi.Appender.__init__(self)
 
-        def append(self, level: Any, text: str) -> None:
+        def append(self, level: mi.LogLevel, text: str) -> None:
             if "Received interrupt signal" in text:  # while it renders Mitsuba listens in the place of Python
                 interrupts.received = interrupts.received or signal.SIGINT
             elif level >= mi.LogLevel.Warn:
                 typer.echo(f"warning: {' '.join(text.split())}", err=True)
 
-        def log_progress(self, *_: Any) -> None:
+        def log_progress(self, *_: object) -> None:
             pass
 
     logger = mi.logger()

@@ -459,7 +459,7 @@ class PositionSampler:
 
     def density(
         self, p: mi.Point3f, n: mi.Normal3f, face: mi.UInt32, out: SurfacePoint, axes: tuple[mi.Vector3f, ...]
-    ) -> Any:
+    ) -> mi.Float:
         """Density of candidates over the surface at p with normal n, for each that is drawn, 1/(scene unit)²."""
         return self._candidates(p, n, self.points.brightness(face), out, axes) * opaque(
             1 / (self.probes + self.area_points)
@@ -467,7 +467,7 @@ class PositionSampler:
 
     def _candidates(
         self, p: mi.Point3f, n: mi.Normal3f, b: mi.Float, out: SurfacePoint, axes: tuple[mi.Vector3f, ...]
-    ) -> Any:
+    ) -> mi.Float:
         """c = D + m b/A, 1/(scene unit)²."""
         uniform = b * opaque(self.area_points / self.geometry.area if self.area_points else 0.0)
         if not self.probes:
@@ -500,7 +500,7 @@ class PositionSampler:
 
     def _probe(
         self, out: SurfacePoint, axes: tuple[mi.Vector3f, ...], u_axis: mi.Float, u_length: mi.Float, u: mi.Point2f
-    ) -> Any:
+    ) -> mi.Ray3f:
         n, s, t = axes
         to_n, to_s = u_axis < NORMAL_SHARE, u_axis < 0.5 * (1 + NORMAL_SHARE)
         along = dr.select(to_n, n, dr.select(to_s, s, t))

@@ -7,11 +7,11 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
 from full_geometry.geometry.sensors import camera_rays
 from full_geometry.surface.textured import linear_of_srgb
@@ -42,7 +42,9 @@ class GivenView:
     held_out: bool = False
 
     @classmethod
-    def of(cls, name: str, sensor: int, image: Any, mask: Any = None, held_out: bool = False) -> GivenView:
+    def of(
+        cls, name: str, sensor: int, image: ArrayLike, mask: ArrayLike | None = None, held_out: bool = False
+    ) -> GivenView:
         """Check an image of any kind; pixels count where `mask` is > 0.5.
 
         Raises:
@@ -91,7 +93,7 @@ def read_views(path: str | Path) -> list[GivenView]:
     return [_view(path, row) for row in rows]
 
 
-def _view(path: Path, row: Any) -> GivenView:
+def _view(path: Path, row: object) -> GivenView:
     if not isinstance(row, dict) or "image" not in row:
         raise ValueError(f"{path}: a view must have `image`, got {row!r}")
     for key in row.keys() - set(KEYS):

@@ -16,7 +16,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -64,7 +64,7 @@ class _Sums:
     def __init__(self, n_exits: int) -> None:
         self.n_exits, self.n, self.sums = n_exits, 0, 0.0
 
-    def add(self, value: Any, w: Any, per_exit: int) -> None:
+    def add(self, value: mi.Spectrum, w: mi.Vector3f, per_exit: int) -> None:
         """Samples of all exits, `per_exit` neighbouring lanes for each: value per channel of unit light from w."""
         lights = [mi.Float(1)] + [dr.maximum(dr.dot(w, mi.Vector3f(*axis.tolist())), 0) ** POWER for axis in LOBES]
         products = [[v * light + 0 * v for light in lights] for v in value]

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -70,7 +69,7 @@ class DenseLayers(nn.Module):
             b.copy_(torch.from_numpy(arrays[f"{bias}_{k}"].astype(np.float32))[:, None])
 
     def arrays(self, matrix: str, bias: str) -> dict[str, np.ndarray]:
-        arrays: dict[str, Any] = {}
+        arrays: dict[str, np.ndarray] = {}
         for k, (W, b) in enumerate(zip(self.matrices, self.biases)):
             W, b = (v.detach().cpu().numpy().copy() for v in (W, b))
             arrays |= {f"{matrix}_{k}": W, f"{bias}_{k}": b[:, 0].copy()}

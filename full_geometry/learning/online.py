@@ -17,6 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from full_geometry.integrators.bssrdf import is_bssrdf
@@ -40,7 +41,7 @@ def files(path: Path) -> dict[str, Path]:
     return {name: path.with_suffix(f".{name}") for name in ("walks.exr", "model.exr", "training")}
 
 
-def untrained(scene: Any) -> dict[str, list[str]]:
+def untrained(scene: mi.Scene) -> dict[str, list[str]]:
     """Ids of the objects that have to be trained before the scene can be rendered, by the name of their model.
 
     Raises:
@@ -57,7 +58,7 @@ def untrained(scene: Any) -> dict[str, list[str]]:
 
 
 def render(
-    scene: Any,
+    scene: mi.Scene | dict[str, Any] | str | os.PathLike,
     path: str | os.PathLike,
     *,
     train_seconds: float,
@@ -138,7 +139,7 @@ def render(
 
 
 def _learnt(
-    scene: Any, walks: CameraWalks, enough: dict[str, Any], work: Path, learning: NamedProgress | None,
+    scene: mi.Scene, walks: CameraWalks, enough: dict[str, Any], work: Path, learning: NamedProgress | None,
     told: Callable[[str], None],
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Learn one object after the other; those of the same mesh and medium share what was learnt."""
@@ -160,7 +161,7 @@ def _learnt(
     return records
 
 
-def _join(scene: Any) -> bool:
+def _join(scene: mi.Scene) -> bool:
     """Whether walks show what the models show: all objects are learnt and unmasked, and paths go past an object.
 
     Exits on instances are of several places, and no data for learning.

@@ -477,7 +477,7 @@ class PairData:
         return {name: np.asarray(getattr(self, name)) for name in NAMES}
 
     @classmethod
-    def from_arrays(cls, arrays: Any) -> PairData:
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> PairData:
         """Read pairs from the arrays of a file; KeyError if it is another one."""
         stored = {name: arrays[name] for name in NAMES}
         return cls(**{**stored, "share": float(stored["share"])})

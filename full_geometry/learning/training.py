@@ -10,7 +10,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -42,6 +42,9 @@ from halfspace_sss.neural.store import check_weights_folder, to_json
 from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder, provenance, write_atomically
+
+if TYPE_CHECKING:
+    from full_geometry.integrators.walk_paths import FirstExits
 
 # ---- Where the learnt directional albedo is good enough for images ----------------------------
 # S sees the surface around both its points, alpha is a network of the exit alone, which misses what changes over a mean
@@ -179,7 +182,7 @@ class CameraExits:
         return parts
 
 
-def _points(part: Any) -> tuple[SurfacePoint, WalkExits]:
+def _points(part: FirstExits) -> tuple[SurfacePoint, WalkExits]:
     """First exits of the camera as walks of this package, of the orders from one on."""
     starts = SurfacePoint(part.x_o, part.n_o, part.n_o_shading, part.w_o)
     ends = SurfacePoint(part.x_i, part.n_i, part.n_i_shading, part.w_i)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -59,7 +58,9 @@ def _references(props: mi.Properties) -> list[tuple[str, int]]:
     return [(key, value.index()) for key, value in values if isinstance(value, mi.Properties.ResolvedReference)]
 
 
-def _fill(config: Any, state: Any, shape: Any, mm_per_unit: float) -> None:
+def _fill(
+    config: mi.parser.ParserConfig, state: mi.parser.ParserState, shape: mi.Properties, mm_per_unit: float
+) -> None:
     """Replace the translucent surface of a shape by its boundary and an interior medium."""
     for key, index in _references(shape):
         if state.nodes[index].props.plugin_name() != "translucent":
@@ -72,7 +73,7 @@ def _fill(config: Any, state: Any, shape: Any, mm_per_unit: float) -> None:
         return
 
 
-def _instance(config: Any, state: Any, index: int) -> Any:
+def _instance(config: mi.parser.ParserConfig, state: mi.parser.ParserState, index: int) -> mi.Object:
     """The object that a node stands for."""
     root, node = mi.parser.SceneNode(state.nodes[0]), mi.parser.SceneNode(state.nodes[index])
     state.nodes[0] = node
@@ -82,7 +83,7 @@ def _instance(config: Any, state: Any, index: int) -> Any:
         state.nodes[0] = root
 
 
-def _replace_integrator(state: Any, integrator: dict) -> None:
+def _replace_integrator(state: mi.parser.ParserState, integrator: dict) -> None:
     root = state.nodes[0].props
     names = [key for key, index in _references(root) if state.nodes[index].type == mi.ObjectType.Integrator]
     unknown = [key for key, index in _references(root) if state.nodes[index].props.plugin_name() in _OURS]
@@ -132,7 +133,7 @@ def _volumes(varying: VaryingMedium, mm_per_unit: float) -> dict:
     return {"sigma_t": sigma_t, "albedo": volume, "scale": scale}
 
 
-def _one_voxel(values: np.ndarray) -> Any:
+def _one_voxel(values: np.ndarray) -> mi.Volume:
     """A volume that is the same everywhere: Mitsuba's constant ones take colours up to one only."""
     grid = mi.VolumeGrid(np.asarray(values, dtype=np.float32).reshape(1, 1, 1, -1))
     anywhere = mi.ScalarTransform4f().scale(2 * FAR).translate(-0.5)

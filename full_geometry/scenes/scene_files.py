@@ -11,7 +11,7 @@ import re
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
 
@@ -20,6 +20,9 @@ from full_geometry.settings import LIGHTS, ORDERS, PATH_TRACED, SHARED, WALK_LIG
 from full_geometry.surface.wrapped import surface_of
 from full_geometry.transport.models import model_names, of_objects
 from halfspace_sss.interrupts import is_interrupt
+
+if TYPE_CHECKING:
+    from mitsuba.parser import ParserConfig, ParserState
 
 _HERE = str(Path(__file__).parents[2])
 
@@ -108,7 +111,7 @@ def load_scene(
     orders: str | None = None,
     parameters: Mapping[str, str] | None = None,
     settings: Mapping[str, float] | None = None,
-) -> Any:
+) -> mi.Scene:
     """A Mitsuba scene with translucent objects, ready to be rendered.
 
     Where model or orders are asked for and the integrator of the scene shows no light from inside, ours takes its
@@ -142,7 +145,7 @@ def open_scene(
     parameters: Mapping[str, str] | None = None,
     settings: Mapping[str, float] | None = None,
     floats: bool = False,
-) -> Any:
+) -> mi.Scene:
     """Load a scene as `load_scene` does, but make no model yet.
 
     With `floats`, texels of bitmaps are floats, which can be changed by any amount, whatever their files have.
@@ -172,7 +175,7 @@ def open_scene(
     return loaded
 
 
-def _set_parameters(state: Any, plugin: str, settings: Mapping[str, float | str]) -> None:
+def _set_parameters(state: ParserState, plugin: str, settings: Mapping[str, float | str]) -> None:
     for node in state.nodes if settings else ():
         if node.props.plugin_name() == plugin:
             for key, value in settings.items():
@@ -185,7 +188,7 @@ def _settings(settings: Mapping[str, float]) -> tuple[dict, dict]:
     return {key: value for key, value in settings.items() if key != "layers"}, walk
 
 
-def load_objects(scene: dict | str | Path, parameters: Mapping[str, str] | None = None) -> Any:
+def load_objects(scene: dict | str | Path, parameters: Mapping[str, str] | None = None) -> mi.Scene:
     """A Mitsuba scene whose objects are looked at one by one: none is merged with another, and no model is made.
 
     Args:
@@ -209,7 +212,7 @@ def _check(name: str, value: str | None, known: tuple[str, ...]) -> None:
         raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}{hint}")
 
 
-def _surfaces(state: Any) -> list[Any]:
+def _surfaces(state: ParserState) -> list[mi.Properties]:
     """The parameters of all translucent surfaces."""
     results = [node.props for node in state.nodes if node.props.plugin_name() == "translucent"]
     if not results:
@@ -217,7 +220,7 @@ def _surfaces(state: Any) -> list[Any]:
     return results
 
 
-def _made(scene: dict | str | Path, state: Any, config: Any) -> Any:
+def _made(scene: dict | str | Path, state: ParserState, config: ParserConfig) -> mi.Scene:
     """The scene; files that an XML file names are looked for beside it first."""
     before, here = mi.file_resolver(), mi.FileResolver(mi.file_resolver())
     if not isinstance(scene, dict):
@@ -231,7 +234,7 @@ def _made(scene: dict | str | Path, state: Any, config: Any) -> Any:
         mi.set_file_resolver(before)
 
 
-def _parsed(scene: dict | str | Path, parameters: Mapping[str, str]) -> tuple[Any, Any]:
+def _parsed(scene: dict | str | Path, parameters: Mapping[str, str]) -> tuple[ParserState, ParserConfig]:
     check_variant()
     config = mi.parser.ParserConfig(mi.variant())
     config.parallel = False  # objects then have the same numbers each time, and kernels are found in Dr.Jit's cache
@@ -247,7 +250,7 @@ def _parsed(scene: dict | str | Path, parameters: Mapping[str, str]) -> tuple[An
     return state, config
 
 
-def _transform(scene: dict | str | Path, state: Any, config: Any, apart: bool) -> None:
+def _transform(scene: dict | str | Path, state: ParserState, config: ParserConfig, apart: bool) -> None:
     """Resolve what a scene says; meshes of one translucent surface stay `apart`, or become one, as others do."""
     config.merge_meshes = False
     try:
@@ -259,14 +262,14 @@ def _transform(scene: dict | str | Path, state: Any, config: Any, apart: bool) -
         raise _unreadable(scene, error) from error
 
 
-def _apart(state: Any, model: str | None = None) -> bool:
+def _apart(state: ParserState, model: str | None = None) -> bool:
     """Whether what renders a scene knows whole objects, and not what Mitsuba makes of several with the same surface."""
     known = [name for name in (model, *(str(props.get("model", "")) for props in _surfaces(state))) if name]
     walks = model is None and any(node.props.plugin_name() == _INTEGRATORS[True] for node in state.nodes)
     return walks or any(name in model_names() and of_objects(name) for name in known)
 
 
-def _shares_surface(state: Any) -> bool:
+def _shares_surface(state: ParserState) -> bool:
     """Whether two meshes have the same translucent surface, which Mitsuba would merge."""
     found = []
     for node in state.nodes:
@@ -281,7 +284,7 @@ def _references(props: Any) -> list[int]:
     return [value.index() for value in values if isinstance(value, mi.Properties.ResolvedReference)]
 
 
-def _is_translucent(state: Any, index: int) -> bool:
+def _is_translucent(state: ParserState, index: int) -> bool:
     """Whether a node is a translucent surface, or something around one."""
     props = state.nodes[index].props
     return props.plugin_name() == "translucent" or any(_is_translucent(state, k) for k in _references(props))
@@ -327,7 +330,7 @@ def _unreadable(scene: dict | str | Path, error: RuntimeError) -> ValueError:
 
 
 def _choose_integrator(
-    state: Any, walks: bool, unnamed: bool, asked: tuple[bool, bool], settings: Mapping[str, float]
+    state: ParserState, walks: bool, unnamed: bool, asked: tuple[bool, bool], settings: Mapping[str, float]
 ) -> None:
     """Make the integrator fit: whether a model, or anything, is asked for; one that is made gets the settings.
 
@@ -356,7 +359,7 @@ def _choose_integrator(
         )
 
 
-def _set_integrator(props: Any, plugin: str) -> None:
+def _set_integrator(props: mi.Properties, plugin: str) -> None:
     if props.plugin_name() == plugin:
         return
     props.set_plugin_name(plugin)

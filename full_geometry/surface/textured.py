@@ -15,6 +15,7 @@ import re
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from types import ModuleType
 from typing import Any
 
 import drjit as dr
@@ -31,6 +32,7 @@ NODES = 1025  # of the table of x by reflectance
 BY_UV = ("BitmapTexture", "Checkerboard")
 KNOWN = (*BY_UV, "MeshAttribute", "UniformSpectrum", "SRGBReflectanceSpectrum")  # of which all values are known
 LUMINANCE = np.array([[0.212671], [0.715160], [0.072169]])  # of linear sRGB, as Mitsuba has it
+Number = "mi.Float | np.ndarray | float"
 UNKNOWN = {"albedo": 0.5, "reflectance": 0.2, "sigma_t": 1.0, "mfp": 1.0}  # means of attributes before a mesh is known
 
 
@@ -88,7 +90,7 @@ def bend(g: float) -> float:
     return (1 - max(g, 0.0)) ** (1 / 3)
 
 
-def x_of_albedo(lib: Any, albedo: Any, g: Any, c: Any) -> Any:
+def x_of_albedo(lib: ModuleType, albedo: Number, g: Number, c: Number) -> Number:
     """x of `physics.reflectance`: 0 for albedo 1, 1 for albedo 0.
 
     Args:

@@ -94,9 +94,9 @@ class TechniqueTrade:
 
 
 def samples_for(row: TechniqueTrade, tolerance: float) -> float:
-    """Samples n of a pixel by which bias² + variance / n and z = DOUBT of its standard errors are at tolerance²; inf for none.
+    """Samples n of a pixel by which bias² + variance / n and z of its standard errors are at tolerance²; inf for none.
 
-    With a = tolerance² - bias² the smaller root of (a - V / n)² = z² (s² + (v / n)²).
+    With a = tolerance² - bias² and z = DOUBT the smaller root of (a - V / n)² = z² (s² + (v / n)²).
     """
     a, s, v = tolerance**2 - max(row.bias2, 0.0), DOUBT * row.bias2_error, DOUBT * row.variance_error
     if not a > s:
@@ -194,7 +194,7 @@ class Assessment:
         return cls(tuple(objects), record["seconds"], record["compilation"], record["seed"])
 
 
-def plain(value: Any) -> Any:
+def plain(value: object) -> object:
     """Without nan, which JSON has not."""
     if isinstance(value, dict):
         return {key: plain(v) for key, v in value.items()}
@@ -203,7 +203,7 @@ def plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _known(key: str, value: Any) -> Any:
+def _known(key: str, value: object) -> object:
     """A field of a `TechniqueTrade` from JSON."""
     if key in ("ratio", "ratio_error"):
         return tuple(math.nan if v is None else v for v in value)

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from types import ModuleType
 
 import drjit as dr
 import mitsuba as mi
@@ -51,7 +51,7 @@ from full_geometry.transport.descriptors import (
     phases,
 )
 from full_geometry.transport.exit_pairs import EntryProposals, trace_exits, trace_scores
-from full_geometry.transport.features import Side
+from full_geometry.transport.features import Lanes, Side
 from full_geometry.transport.half_space import HalfSpaceProposals, area_share
 from full_geometry.transport.one_object import HalfSpace
 from halfspace_sss.interface.model import BSSRDF
@@ -98,12 +98,12 @@ class Backbone(HalfSpace):
         super().__init__(obj, MODEL, FLOOR, precise)
         self.mixtures = mixtures
 
-    def added(self, exit: Side, entry: Side) -> list[Any]:
+    def added(self, exit: Side, entry: Side) -> list[mi.Float]:
         """Per channel the floor, what is mixed and what is scattered twice, over F_t(w_o) P_o F_t(w_i) P_i."""
         everywhere = [opaque(floor + mixture.M) for floor, mixture in zip(self.floors, self.mixtures)]
         return [G + S for G, S in zip(everywhere, self.twice(exit, entry))]
 
-    def shares(self, S_0: Any, exit: Side, entry: Side) -> list[tuple[Any, Any]]:
+    def shares(self, S_0: mi.Spectrum, exit: Side, entry: Side) -> list[tuple[mi.Float, mi.Float]]:
         """Per channel the parts of S_0, of this pair, that are mixed and that are scattered twice; 0 on a plane."""
         F_t = self.query(exit.at, entry.at)[1]
         parts = []
@@ -114,7 +114,7 @@ class Backbone(HalfSpace):
             parts.append((opaque(mixture.M) * over, twice * over))
         return parts
 
-    def twice(self, exit: Side, entry: Side) -> Any:
+    def twice(self, exit: Side, entry: Side) -> mi.Spectrum:
         """S_twice/(F_t(w_o) P_o F_t(w_i) P_i) per channel, that of a plane taken off."""
         eta = self.object.eta
         o, i = (refract_in(side.at, eta)[0] for side in (exit, entry))
@@ -132,7 +132,7 @@ class Backbone(HalfSpace):
         return mi.Spectrum(channels)
 
 
-def _twice(m: Medium, d_o: Any, d_i: Any, line: Segment, spread: Any) -> Any:
+def _twice(m: Medium, d_o: mi.Vector3f, d_i: mi.Vector3f, line: Segment, spread: mi.Float) -> mi.Float:
     """Both phase functions and the attenuation along a line over its squared length, times (4 pi)²."""
     t = opaque(float(m.sigma_t))
     apart = dr.square(line.length) + spread / 12 + LEAST_LENGTH2 / dr.square(dr.maximum(t, 1e-20))
@@ -197,11 +197,11 @@ class NeuralShape(Transport):
         return Perceptron.named(self.weights, "W", "b", splits=[N_OWN], looped=self.precise)
 
     @functools.cached_property
-    def _media(self) -> list[list[Any]]:
+    def _media(self) -> list[list[mi.Float]]:
         return [[opaque(v) for v in numbers] for numbers in self.media]
 
     @functools.cached_property
-    def _scale(self) -> Any:
+    def _scale(self) -> mi.Spectrum:
         return mi.Spectrum([opaque(s) for s in self.scales or [1.0] * len(self.media)])
 
     @property
@@ -209,15 +209,15 @@ class NeuralShape(Transport):
         """The half-space model of each channel."""
         return self.half_space.models
 
-    def end(self, at: SurfacePoint, active: Any = True) -> End:
+    def end(self, at: SurfacePoint, active: mi.Bool = True) -> End:
         """What belongs to one end alone."""
         return end(self.object, at, active)
 
-    def prepare(self, at: SurfacePoint, active: Any = True) -> End:
+    def prepare(self, at: SurfacePoint, active: mi.Bool = True) -> End:
         """The exit's side, for as many entries as are asked for."""
         return self.end(at, active)
 
-    def S(self, exit: End, at: SurfacePoint, active: Any = True) -> Any:
+    def S(self, exit: End, at: SurfacePoint, active: mi.Bool = True) -> mi.Spectrum:
         """S(x_i, w_i; x_o, w_o) per channel, 1/((scene unit)² sr); 0 below the horizons.
 
         Args:
@@ -227,14 +227,14 @@ class NeuralShape(Transport):
         """
         return self(exit, self.end(at, active), active)
 
-    def __call__(self, exit: End, entry: End, active: Any = True) -> Any:
+    def __call__(self, exit: End, entry: End, active: mi.Bool = True) -> mi.Spectrum:
         """S of two ends, as `S`."""
         S_0 = self.half_space(exit, entry)
         pairs = describe(self.object, exit, entry, self.half_space.shares(S_0, exit, entry), active)
         f = mi.Spectrum([self._f(pair, numbers) for pair, numbers in zip(pairs, self._media)])
         return dr.select(active, S_0 * dr.exp(f) * self._scale, 0)
 
-    def _f(self, pair: Pair, numbers: list[Any]) -> Any:
+    def _f(self, pair: Pair, numbers: list[mi.Float]) -> mi.Float:
         net = self._network
         rest = net.first(1, [*pair.shared, *numbers], biased=True)
         ends = [net.activation(net.first(0, own) + rest) for own in (pair.exit, pair.entry)]
@@ -246,7 +246,7 @@ class NeuralShape(Transport):
         return bound * dr.tanh(g / bound)
 
 
-def most(lib: Any, g: Any) -> Any:
+def most(lib: ModuleType, g: Lanes) -> Lanes:
     """The bound of f above: 3 for g <= 0, falling to 1.5 at g = 0.5.
 
     Light that is scattered forwards comes from few pairs, which too large an f makes far too bright in what is thin.
@@ -303,7 +303,7 @@ class HeldLight:
     scores: np.ndarray
     exits: SurfacePoint
     entries: SurfacePoint
-    over: Any
+    over: mi.Float
 
     @classmethod
     def of(cls, model: NeuralShape) -> HeldLight:
@@ -369,7 +369,9 @@ def _pairs(model: NeuralShape, proposals: EntryProposals, n: int, k: int) -> np.
     return _values(model, *_drawn(model, proposals, n, k))
 
 
-def _drawn(model: NeuralShape, proposals: EntryProposals, n: int, k: int) -> tuple[SurfacePoint, SurfacePoint, Any]:
+def _drawn(
+    model: NeuralShape, proposals: EntryProposals, n: int, k: int
+) -> tuple[SurfacePoint, SurfacePoint, mi.Float]:
     """n random exits, their entries, and mu_i over the density of these."""
     exits = model.object.random_points(generator(mi, n, pass_seed(SEED, 2, k)))
     entries, over = proposals.sample(exits, generator(mi, n, pass_seed(SEED, 3, k)))
@@ -377,7 +379,7 @@ def _drawn(model: NeuralShape, proposals: EntryProposals, n: int, k: int) -> tup
     return exits, entries, over
 
 
-def _values(model: NeuralShape, exits: SurfacePoint, entries: SurfacePoint, over: Any) -> np.ndarray:
+def _values(model: NeuralShape, exits: SurfacePoint, entries: SurfacePoint, over: mi.Float) -> np.ndarray:
     return _rows(dr.select(over > 0, model.S(model.prepare(exits), entries) * over, 0))
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -119,11 +119,11 @@ LEAST_PHASE = 1e-4
 class Segment(NamedTuple):
     """From one point to another: direction, length."""
 
-    d: Any
-    length: Any
+    d: mi.Vector3f
+    length: mi.Float
 
     @classmethod
-    def between(cls, a: Any, b: Any) -> Segment:
+    def between(cls, a: mi.Point3f, b: mi.Point3f) -> Segment:
         """From a to b."""
         way = b - a
         length = dr.norm(way)
@@ -135,13 +135,15 @@ class Segment(NamedTuple):
         return Segment(-self.d, self.length)
 
 
-def on_a_plane(n_o: Any, inner_o: Any, n_i: Any, inner_i: Any, line: Segment) -> tuple[Any, Any]:
+def on_a_plane(
+    n_o: mi.Normal3f, inner_o: mi.Vector3f, n_i: mi.Normal3f, inner_i: mi.Vector3f, line: Segment
+) -> tuple[mi.Vector3f, mi.Vector3f]:
     """The refracted directions as on a plane, x along the line between the points, z along the normals.
 
     There both y lie a mean free path along them.
     """
 
-    def inside(n: Any, along: Any) -> Any:
+    def inside(n: mi.Normal3f, along: mi.Vector3f) -> mi.Vector3f:
         flat = mi.Vector3f(line.d - n * dr.dot(n, line.d))
         spare = mi.coordinate_system(n)[0]
         t = dr.normalize(dr.select(dr.squared_norm(flat) > 1e-12, flat, spare))
@@ -150,7 +152,7 @@ def on_a_plane(n_o: Any, inner_o: Any, n_i: Any, inner_i: Any, line: Segment) ->
     return inside(n_o, inner_o), inside(n_i, inner_i)
 
 
-def phases(g: float, d_o: Any, d_i: Any, d: Any) -> Any:
+def phases(g: float, d_o: mi.Vector3f, d_i: mi.Vector3f, d: mi.Vector3f) -> mi.Float:
     """Both phase functions of light that goes along d from one end to the other, times (4 pi)²."""
     a, b = opaque(1 + g * g), opaque(2 * g)
     c_o, c_i = dr.dot(d_o, d), -dr.dot(d_i, d)
@@ -182,9 +184,9 @@ LEAST_SINE2 = 1e-8  # below it w has no azimuth
 class RaySurroundings(NamedTuple):
     """L and V for each length, and the depth z in scene units."""
 
-    L: list[Any]
-    V: list[Any]
-    depth: Any
+    L: list[mi.Float]
+    V: list[mi.Vector3f]
+    depth: mi.Float
 
 
 def directions(n: int = RAYS) -> np.ndarray:
@@ -195,7 +197,7 @@ def directions(n: int = RAYS) -> np.ndarray:
     return np.stack([s * np.cos(phi), s * np.sin(phi), z])
 
 
-def look(obj: TranslucentObject, at: SurfacePoint, event: FirstEvent, active: Any = True) -> list[RaySurroundings]:
+def look(obj: TranslucentObject, at: SurfacePoint, event: FirstEvent, active: mi.Bool = True) -> list[RaySurroundings]:
     """Surroundings of the first events of each channel; channels of the same extinction share them.
 
     Args:
@@ -213,7 +215,7 @@ def look(obj: TranslucentObject, at: SurfacePoint, event: FirstEvent, active: An
 
 
 def _from(
-    obj: TranslucentObject, at: SurfacePoint, y: Any, extinctions: tuple[float, float], active: Any
+    obj: TranslucentObject, at: SurfacePoint, y: mi.Point3f, extinctions: tuple[float, float], active: mi.Bool
 ) -> RaySurroundings:
     """Surroundings of the points y below the points of a surface, for sigma_t and sigma_t'."""
     tables = [mi.Float(row.astype(np.float32)) for row in directions()]
@@ -222,7 +224,7 @@ def _from(
     n, (t, b) = at.n_out, _tangents(at)
     depth = dr.maximum(dr.dot(at.p - y, n), 0)
 
-    def step(j: Any, *sums: list) -> tuple:
+    def step(j: mi.UInt32, *sums: list) -> tuple:
         u, v, w = (dr.gather(mi.Float, table, j) for table in tables)
         d = mi.Vector3f(t * u + b * v + n * w)
         hit = obj.geometry.scene.ray_intersect_preliminary(mi.Ray3f(y, d), False, active)
@@ -239,7 +241,7 @@ def _from(
     return RaySurroundings(L, V, depth)
 
 
-def _tangents(at: SurfacePoint) -> tuple[Any, Any]:
+def _tangents(at: SurfacePoint) -> tuple[mi.Vector3f, mi.Vector3f]:
     """Two axes across the normal, the first one along w."""
     n = at.n_out
     along = at.w - n * dr.dot(n, at.w)
@@ -284,18 +286,18 @@ class End(NamedTuple):
     at: SurfacePoint
     event: FirstEvent
     around: list[RaySurroundings]
-    inner: Any
+    inner: mi.Vector3f
 
 
 class Pair(NamedTuple):
     """Descriptors of a channel: of both ends, and shared."""
 
-    exit: list[Any]
-    entry: list[Any]
-    shared: list[Any]
+    exit: list[mi.Float]
+    entry: list[mi.Float]
+    shared: list[mi.Float]
 
 
-def end(obj: TranslucentObject, at: SurfacePoint, active: Any = True) -> End:
+def end(obj: TranslucentObject, at: SurfacePoint, active: mi.Bool = True) -> End:
     """What belongs to one end alone, measured once for all partners."""
     inner = refract_in(at, obj.eta)[0]
     event = first_event(obj, at, active)
@@ -313,11 +315,11 @@ def medium(obj: TranslucentObject, channel: int, mixed: Mixed) -> np.ndarray:
 
 
 def describe(
-    obj: TranslucentObject, exit: End, entry: End, shares: Sequence[Sequence[Any]], active: Any = True
+    obj: TranslucentObject, exit: End, entry: End, shares: Sequence[Sequence[mi.Float]], active: mi.Bool = True
 ) -> list[Pair]:
     """The descriptors of pairs for each channel, with the shares of `Backbone`; those of one extinction share rays."""
     line = Segment.between(exit.at.p, entry.at.p)
-    clear: dict[float, tuple[Any, Any]] = {}
+    clear: dict[float, tuple[mi.Float, mi.Float]] = {}
     pairs = []
     for c, m in enumerate(obj.media):
         key = float(m.sigma_t)
@@ -333,8 +335,8 @@ def _channel(
     exit: End,
     entry: End,
     line: Segment,
-    clear: tuple[Any, Any],
-    shares: Sequence[Any],
+    clear: tuple[mi.Float, mi.Float],
+    shares: Sequence[mi.Float],
 ) -> Pair:
     m = obj.media[c]
     s, t, g = opaque(float(m.sigma_t_prime)), opaque(float(m.sigma_t)), float(m.g)
@@ -356,14 +358,14 @@ def _channel(
     ])  # fmt: skip
 
 
-def _onward(g: float, exit: End, entry: End) -> Any:
+def _onward(g: float, exit: End, entry: End) -> mi.Float:
     """0.3 log of a phase function of g², of light that two events turn from one end into the other."""
     g = min(g * abs(g), MOST_G)
     c = -dr.dot(exit.inner, entry.inner)
     return 0.3 * dr.log(opaque(1 - g * g) / (opaque(1 + g * g) - opaque(2 * g) * c))
 
 
-def _own(c: int, sigma_t: Any, here: End, there: End, line: Segment, gap: Segment) -> list[Any]:
+def _own(c: int, sigma_t: mi.Float, here: End, there: End, line: Segment, gap: Segment) -> list[mi.Float]:
     at, event, n, around = here.at, here.event, here.at.n_out, here.around[c]
     return [
         dr.dot(at.w, n), -dr.dot(here.inner, n), dr.dot(at.w, line.d), dr.dot(at.w, there.at.n_out),
@@ -375,11 +377,11 @@ def _own(c: int, sigma_t: Any, here: End, there: End, line: Segment, gap: Segmen
     ]  # fmt: skip
 
 
-def _clearance(obj: TranslucentObject, a: Any, b: Any, active: Any) -> tuple[Any, Any]:
+def _clearance(obj: TranslucentObject, a: mi.Point3f, b: mi.Point3f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
     """Of the line between two points inside: 1 if it leaves the object, else 0; the length that it is outside for."""
     line = Segment.between(a, b)
 
-    def reach(start: Any, d: Any, needed: Any) -> Any:
+    def reach(start: mi.Point3f, d: mi.Vector3f, needed: mi.Bool) -> mi.Float:
         hit = obj.geometry.scene.ray_intersect_preliminary(mi.Ray3f(start, d), False, needed)
         return dr.select(hit.is_valid() & (hit.t < line.length), hit.t, line.length)
 

@@ -11,7 +11,7 @@ A walk that meets something inside the object is one of two scattering events at
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -43,6 +43,9 @@ from full_geometry.walk.scores import Score, scored_exits
 from halfspace_sss.checks import check_count
 from halfspace_sss.tracing.walk import generator, pass_seed
 
+if TYPE_CHECKING:
+    import torch
+
 
 def trace_exits(
     obj: TranslucentObject,
@@ -66,7 +69,7 @@ def trace_exits(
     return exits(media_within(obj), 0, starts, seed, fewest, most)
 
 
-def trace_scores(obj: TranslucentObject, starts: SurfacePoint, seed: tuple[int, ...]) -> tuple[Any, Score]:
+def trace_scores(obj: TranslucentObject, starts: SurfacePoint, seed: tuple[int, ...]) -> tuple[mi.Spectrum, Score]:
     """T of one walk from each start, of two events and more, and the scores of walks that left."""
     exits, scores = scored_exits(media_within(obj), 0, starts, seed, 2)
     return exits.T, scores
@@ -80,13 +83,13 @@ ENOUGH = 1.5  # over the mean: pairs of less value are kept by chance, and then 
 class Numbers:
     """Uniform numbers of a generator under the names that Mitsuba's samplers give them."""
 
-    def __init__(self, rng: Any) -> None:
+    def __init__(self, rng: mi.PCG32) -> None:
         self.rng = rng
 
-    def next_1d(self) -> Any:
+    def next_1d(self) -> mi.Float:
         return self.rng.next_float32()
 
-    def next_2d(self) -> Any:
+    def next_2d(self) -> mi.Point2f:
         return mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
 
 
@@ -107,7 +110,7 @@ class Pairs(NamedTuple):
     albedo: AlbedoSamples | None = None  # of some of the walks
     random: tuple[np.ndarray, int] | None = None  # where not all exits are random: which are, and how many were drawn
 
-    def of_random_exits(self, x: Any, values: Any) -> tuple[Any, Any, int]:
+    def of_random_exits(self, x: torch.Tensor, values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, int]:
         """Columns of features and values of random exits alone, and how many were drawn."""
         if self.random is None:
             return x, values, self.drawn
@@ -158,8 +161,8 @@ class EntryProposals:
         self.positions = PositionSampler(replace(obj.geometry, pieces=None), table, obj.points, area_share)
 
     def sample(
-        self, exit: SurfacePoint, rng: Any, table: ExitTable | None = None, k: Any = 0
-    ) -> tuple[SurfacePoint, Any]:
+        self, exit: SurfacePoint, rng: mi.PCG32, table: ExitTable | None = None, k: mi.UInt32 | int = 0
+    ) -> tuple[SurfacePoint, mi.Float]:
         """An entry for each exit, and mu_i over its density; 0 where none was found.
 
         Args:
@@ -199,7 +202,7 @@ class PairSource:
     frame: ObjectFrame
     base: BaseModel
     proposals: EntryProposals
-    scale: Any = None
+    scale: mi.Spectrum | None = None
 
     def scaled(self, scale: np.ndarray) -> PairSource:
         """The same with the scale of a fit, so that its mean over channels that have any light is 1."""
@@ -261,7 +264,7 @@ class PairSource:
         entries, weight = self.proposals.sample(starts, rng)
         return self._columns(starts, entries, weight)
 
-    def _columns(self, exits: SurfacePoint, entries: SurfacePoint, value: Any) -> Pairs:
+    def _columns(self, exits: SurfacePoint, entries: SurfacePoint, value: mi.Spectrum | mi.Float) -> Pairs:
         """Features of pairs; `value` is a spectrum, or a weight that S_0 is to be multiplied by."""
         exit, entry = (self.base.end(at) for at in (exits, entered(entries, exits)))
         if isinstance(value, mi.Float):
@@ -274,7 +277,7 @@ class PairSource:
         return Pairs(features, np.array(value, dtype=np.float32).reshape(len(value), n), n)
 
 
-def _stacked(columns: list[Any], n: int) -> np.ndarray:
+def _stacked(columns: list[mi.Float], n: int) -> np.ndarray:
     """Columns of n lanes as rows."""
     dr.eval(columns)
     return np.stack([np.broadcast_to(c.numpy(), n) for c in columns])

@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -45,6 +45,7 @@ from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.physics import fresnel
 from halfspace_sss.tracing.walk import generator, pass_seed
 
+Lanes = "mi.Float | np.ndarray | torch.Tensor"
 REFLECTIONS = 32
 NEGLIGIBLE = 1e-3  # weight of what is still inside
 CELLS, FIRST_CELL = 12, 0.25  # of a march; the first one in mean free paths
@@ -57,32 +58,36 @@ class FirstEvent(NamedTuple):
     textures those of the exit.
     """
 
-    P: Any
-    y: Any
-    length: Any
-    ys: Any
-    lengths: Any
-    local: tuple[Any, ...] = ()
+    P: mi.Spectrum
+    y: mi.Point3f
+    length: mi.Float
+    ys: list[mi.Point3f]
+    lengths: mi.Spectrum
+    local: tuple[mi.Float, ...] = ()
 
 
-def flight(obj: TranslucentObject, o: Any, d: Any, l: Any, sigma_t: Any) -> tuple[Any, Any]:  # noqa: E741
-    """exp(-∫ sigma_t) over a length l from o along d, and ∫ s sigma_t exp(-∫ sigma_t) ds, per channel.
+def flight(
+    obj: TranslucentObject, o: mi.Point3f, d: mi.Vector3f, length: mi.Float, sigma_t: mi.Spectrum
+) -> tuple[mi.Spectrum, mi.Spectrum]:
+    """exp(-∫ sigma_t) over a length from o along d, and ∫ s sigma_t exp(-∫ sigma_t) ds, per channel.
 
     A medium that varies is marched in cells that grow from a part of a mean free path on, each homogeneous.
     """
 
-    def add(sigma_t: Any, T: Any, inner: Any, s: Any, h: Any) -> tuple[Any, Any]:
+    def add(
+        sigma_t: mi.Spectrum, T: mi.Spectrum, inner: mi.Spectrum, s: mi.Float, h: mi.Float
+    ) -> tuple[mi.Spectrum, mi.Spectrum]:
         through = dr.minimum(dr.exp(-sigma_t * h), 1)
         mean = dr.maximum((1 - through) / dr.maximum(sigma_t, 1e-20) - h * through, 0)  # rounding, of short ways
         return T * through, inner + T * (mean + s * (1 - through))
 
     T, inner = mi.Spectrum(1), mi.Spectrum(0)
     if obj.varying is None:
-        return add(sigma_t, T, inner, mi.Float(0), l)
-    h = dr.minimum(l / CELLS, FIRST_CELL / dr.max(sigma_t))
-    growth = _growth(l / h)
+        return add(sigma_t, T, inner, mi.Float(0), length)
+    h = dr.minimum(length / CELLS, FIRST_CELL / dr.max(sigma_t))
+    growth = _growth(length / h)
 
-    def cell(k: Any, s: Any, h: Any, T: Any, inner: Any) -> tuple:
+    def cell(k: mi.UInt32, s: mi.Float, h: mi.Float, T: mi.Spectrum, inner: mi.Spectrum) -> tuple:
         sigma_t = walk_media(obj).heterogeneous.sigma_t(mi.UInt32(0), o + d * (s + 0.5 * h))
         T, inner = add(sigma_t, T, inner, s, h)
         return k + 1, s + h, h * growth, T, inner
@@ -91,7 +96,7 @@ def flight(obj: TranslucentObject, o: Any, d: Any, l: Any, sigma_t: Any) -> tupl
     return dr.while_loop(state, lambda k, *_: k < CELLS, cell, label="march")[3:]
 
 
-def _growth(ratio: Any) -> Any:
+def _growth(ratio: mi.Float) -> mi.Float:
     """q with 1 + q + ... + q^(CELLS-1) = ratio >= CELLS, by a few steps of Newton on its logarithm."""
     x = dr.maximum(dr.log(ratio) / CELLS, 1e-3)
     for _ in range(5):
@@ -138,7 +143,7 @@ def _varied(obj: TranslucentObject, p: mi.Point3f) -> tuple[mi.Float, ...]:
     )
 
 
-def first_event(obj: TranslucentObject, at: SurfacePoint, active: Any = True) -> FirstEvent:
+def first_event(obj: TranslucentObject, at: SurfacePoint, active: mi.Bool = True) -> FirstEvent:
     """Of light that goes in or out along w at a point of the surface."""
     sigma_t = obj.sigma_t if obj.textured is None else at.medium.sigma_t
     eta, sign = obj.eta, opaque(obj.geometry.sign)
@@ -146,7 +151,10 @@ def first_event(obj: TranslucentObject, at: SurfacePoint, active: Any = True) ->
     d, _, valid = refract_in(at, eta)
     flags = mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
 
-    def step(k: Any, o: Any, d: Any, off: Any, v: Any, way: Any, sums: tuple, active: Any) -> tuple:
+    def step(
+        k: mi.UInt32, o: mi.Point3f, d: mi.Vector3f, off: mi.Vector3f, v: mi.Spectrum, way: mi.Float, sums: tuple,
+        active: mi.Bool,
+    ) -> tuple:  # fmt: skip
         P, moments, length = sums
         si = obj.geometry.ray_intersect(mi.Ray3f(mi.Point3f(o + off), d), flags, False, active)
         l = dr.select(si.is_valid(), dr.maximum(si.t + dr.dot(off, d), 0), 1e4 / dr.min(sigma_t))  # noqa: E741
@@ -208,17 +216,17 @@ class Surroundings:
         turns: (2, fields, fields + 1), C^(-1/2) and -C^(-1/2) of the mean for points and for first events.
     """
 
-    textures: tuple[Any, Any]
-    low: Any
-    scale: Any
+    textures: tuple[mi.Texture3f, mi.Texture3f]
+    low: mi.Point3f
+    scale: mi.Vector3f
     turns: np.ndarray
 
-    def __call__(self, q: Any, kind: int) -> list[Any]:
+    def __call__(self, q: mi.Vector3f, kind: int) -> list[mi.Float]:
         """Of a position in the frame, a `POINT` or an `EVENT`."""
         return self.textures[kind].eval((mi.Point3f(q) - self.low) * self.scale)
 
 
-def surroundings(obj: TranslucentObject, frame: Any, turns: np.ndarray | None = None) -> Surroundings:
+def surroundings(obj: TranslucentObject, frame: ObjectFrame, turns: np.ndarray | None = None) -> Surroundings:
     """The fields of an object.
 
     Args:
@@ -244,7 +252,7 @@ def surroundings(obj: TranslucentObject, frame: Any, turns: np.ndarray | None = 
     return turned(_turns(obj, frame, turned(np.stack([straight] * 2))) if turns is None else turns)
 
 
-def _turns(obj: TranslucentObject, frame: Any, fields: Surroundings) -> np.ndarray:
+def _turns(obj: TranslucentObject, frame: ObjectFrame, fields: Surroundings) -> np.ndarray:
     """C^(-1/2) of the fields over random points and over their first events, with what takes their means off."""
     at = obj.random_points(generator(mi, POINTS, pass_seed(SEED)))
     turns = []
@@ -259,7 +267,7 @@ def _turns(obj: TranslucentObject, frame: Any, fields: Surroundings) -> np.ndarr
     return np.array(turns, dtype=np.float32)
 
 
-def specs(obj: TranslucentObject, frame: Any, low: np.ndarray, cell: float, cells: np.ndarray) -> np.ndarray:
+def specs(obj: TranslucentObject, frame: ObjectFrame, low: np.ndarray, cell: float, cells: np.ndarray) -> np.ndarray:
     """1 where the middle of a cell lies inside, (z, y, x): where most of three rays meet the surface from within."""
     nx, ny, _ = (int(n) for n in cells)
     k = dr.arange(mi.UInt32, int(np.prod(cells)))
@@ -280,7 +288,7 @@ def _fields(inside: np.ndarray, path: float) -> np.ndarray:
     return np.stack([*balls, *(WIDTHS[SLOPED] * path * part for part in slope)], axis=-1)
 
 
-def _bounds(obj: TranslucentObject, frame: Any) -> tuple[np.ndarray, np.ndarray]:
+def _bounds(obj: TranslucentObject, frame: ObjectFrame) -> tuple[np.ndarray, np.ndarray]:
     """Of the object in its frame."""
     if mesh.has_faces(obj.geometry.shape):
         corners = mi.Point3f(mesh.vertex_positions(obj.geometry.shape).T)
@@ -325,22 +333,22 @@ class ObjectFrame:
         around: how much of the object surrounds a position in the frame.
     """
 
-    centre: Any
-    radius: Any
-    sigma_t: Any
-    each: tuple[Any, ...]
-    turn: Any = None
+    centre: mi.Point3f
+    radius: mi.Float
+    sigma_t: mi.Float
+    each: tuple[mi.Float, ...]
+    turn: list[mi.Vector3f] | None = None
     around: Surroundings | None = None
 
-    def position(self, p: Any) -> Any:
+    def position(self, p: mi.Point3f) -> mi.Vector3f:
         """In the frame, of order one."""
         return self.direction(p - self.centre) / self.radius
 
-    def direction(self, w: Any) -> Any:
+    def direction(self, w: mi.Vector3f) -> mi.Vector3f:
         """In the frame."""
         return mi.Vector3f(w) if self.turn is None else mi.Vector3f(*(dr.dot(row, w) for row in self.turn))
 
-    def back(self, q: Any, d: Any) -> tuple[Any, Any]:
+    def back(self, q: mi.Vector3f, d: mi.Vector3f) -> tuple[mi.Point3f, mi.Vector3f]:
         """A position and a direction of the frame in the world."""
         q, d = (v if self.turn is None else sum(row * x for row, x in zip(self.turn, v)) for v in (q, d))
         return mi.Point3f(self.centre + mi.Vector3f(q) * self.radius), mi.Vector3f(d)
@@ -399,7 +407,7 @@ class Quadratic:
         self._line = Perceptron([line[:, 1:]], [line[:, 0]], looped=True)
         self._square = Perceptron([square], [np.zeros(len(square), np.float32)], looped=True)
 
-    def __call__(self, columns: list[Any]) -> list[Any]:
+    def __call__(self, columns: list[mi.Float]) -> list[mi.Float]:
         """Of the features of a side."""
         heads = [columns[k - 1] for k in self.heads]
         y = self._square(heads)
@@ -407,7 +415,7 @@ class Quadratic:
         return [sum((a * b for a, b in zip(heads, row)), first) for row, first in zip(rows, self._line(columns))]
 
 
-def _octaves(x: Any) -> list[Any]:
+def _octaves(x: mi.Vector3f) -> list[mi.Float]:
     columns = list(x)
     for k in range(OCTAVES):
         for component in x:
@@ -415,7 +423,7 @@ def _octaves(x: Any) -> list[Any]:
     return columns
 
 
-def side_features(frame: ObjectFrame, side: Side) -> list[Any]:
+def side_features(frame: ObjectFrame, side: Side) -> list[mi.Float]:
     """Position and y with two octaves of sine and cosine, normal, w, mu, log of the way to y, log P, what varies, and
     how much of the object surrounds the position and y.
     """
@@ -429,7 +437,7 @@ def side_features(frame: ObjectFrame, side: Side) -> list[Any]:
     ]  # fmt: skip
 
 
-def entering(columns: Any, eta: Any, channels: int) -> tuple[list[Any], list[Any]]:
+def entering(columns: Sequence[Lanes], eta: Lanes | float, channels: int) -> tuple[list[Lanes], list[Lanes]]:
     """F_t(mu), and F_t(mu) P, per channel: the shares of light along w that enter, and are scattered or absorbed.
 
     Args:
@@ -443,7 +451,7 @@ def entering(columns: Any, eta: Any, channels: int) -> tuple[list[Any], list[Any
     return [F_t] * channels, [F_t * lib.maximum(p, 0 * mu) for p in P]
 
 
-def pair_features(frame: ObjectFrame, exit: Side, entry: Side) -> list[Any]:
+def pair_features(frame: ObjectFrame, exit: Side, entry: Side) -> list[mi.Float]:
     """x_i - x_o as direction and length, log r, log |y_i - y_o|, dot products of directions and normals, and what the
     surface at one end says of y at the other: its depth below the plane there, its distance from the point, and the
     cosine between the way to y and the way on to the other y; log of the distance between the two y of each channel.
@@ -466,17 +474,17 @@ def pair_features(frame: ObjectFrame, exit: Side, entry: Side) -> list[Any]:
     ]  # fmt: skip
 
 
-def _log(sigma_t: Any, length: Any) -> Any:
+def _log(sigma_t: mi.Float, length: mi.Float) -> mi.Float:
     return 0.5 * dr.log(length * sigma_t + LEAST_LENGTH)
 
 
-def _depth(frame: ObjectFrame, at: SurfacePoint, y: Any) -> Any:
+def _depth(frame: ObjectFrame, at: SurfacePoint, y: mi.Point3f) -> mi.Float:
     """t/(1 + |t|) of the depth t below the plane of a point, in mean free paths."""
     t = dr.dot(at.n_out, at.p - y) * frame.sigma_t
     return t / (1 + dr.abs(t))
 
 
-def _cosine(frame: ObjectFrame, side: Side, onward: Any) -> Any:
+def _cosine(frame: ObjectFrame, side: Side, onward: mi.Vector3f) -> mi.Float:
     """Between the way from a point to its y and a direction."""
     way = side.event.y - side.at.p
     return dr.dot(way, onward) / dr.maximum(dr.norm(way), 1e-6 * frame.radius)
@@ -501,10 +509,10 @@ class BaseModel(Protocol):
     @property
     def models(self) -> Sequence[BSSRDF]: ...
 
-    def end(self, at: SurfacePoint, active: Any = True) -> Side:
+    def end(self, at: SurfacePoint, active: mi.Bool = True) -> Side:
         """What belongs to one end alone, its point and its first event among it."""
 
-    def __call__(self, exit: Side, entry: Side, active: Any = True) -> Any:
+    def __call__(self, exit: Side, entry: Side, active: mi.Bool = True) -> mi.Spectrum:
         """S of two ends per channel, 1/((scene unit)² sr); 0 below the horizons."""
 
 
@@ -512,5 +520,5 @@ class PreparedExit(NamedTuple):
     """What is done once for all entries of an exit: its end of the start, its share of the first layer, and h."""
 
     side: Side
-    hidden: list[Any]
-    h: Any = ()
+    hidden: list[mi.Float]
+    h: Sequence[mi.Float] = ()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -91,7 +90,7 @@ class HalfSpaceProposals(Proposals):
     """
 
     positions: PositionSampler
-    model: Any
+    model: BSSRDF
     textured: TexturedMedium | None = None
 
     def lit(self, brightness: np.ndarray) -> HalfSpaceProposals:
@@ -107,12 +106,12 @@ class HalfSpaceProposals(Proposals):
         place = self.positions.geometry, entry.p, entry.n, entry.face
         return entry._replace(medium=self.textured.at_point(*place, active & (entry.weight > 0)))
 
-    def sample_direction(self, entry: EntrySample, out: SurfacePoint, u: mi.Point2f) -> tuple[Any, Any]:
+    def sample_direction(self, entry: EntrySample, out: SurfacePoint, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
         frame = local_frame(entry.n_out, out.p - entry.p)
         drawn = self.model.sample_direction(mi.Float(0), mi.Float(1), mi.Float(0), (u.x, u.y))
         return opposed(mi.Vector3f(frame.direction(drawn.mu_i, drawn.phi_i)), entry.n), drawn.pdf
 
-    def pdf_direction(self, entry: EntrySample, out: SurfacePoint, w_i: mi.Vector3f) -> Any:
+    def pdf_direction(self, entry: EntrySample, out: SurfacePoint, w_i: mi.Vector3f) -> mi.Float:
         mu_i = dr.clip(entry.facing(w_i).mu, 0, 1)
         return self.model.pdf_direction(mu_i, mi.Float(0), mi.Float(0), mi.Float(1), mi.Float(0))
 

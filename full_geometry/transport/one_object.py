@@ -9,7 +9,6 @@ import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -71,11 +70,11 @@ class HalfSpace:
             floors.append(share / (self.object.geometry.area * N))
         return floors
 
-    def end(self, at: SurfacePoint, active: Any = True) -> Side:
+    def end(self, at: SurfacePoint, active: mi.Bool = True) -> Side:
         """What belongs to one end alone."""
         return Side(at, first_event(self.object, at, active))
 
-    def __call__(self, exit: Side, entry: Side, active: Any = True) -> Any:
+    def __call__(self, exit: Side, entry: Side, active: mi.Bool = True) -> mi.Spectrum:
         """1/((scene unit)² sr), 0 below the horizons."""
         query, F_t, above = self.query(exit.at, entry.at)
         if self.palette is None:
@@ -86,7 +85,7 @@ class HalfSpace:
         S_0 = mi.Spectrum([value + F_t * G for value, G in zip(values, self.added(exit, entry))])
         return dr.select(above, S_0 * exit.event.P * entry.event.P, 0)
 
-    def added(self, exit: Side, entry: Side) -> list[Any]:
+    def added(self, exit: Side, entry: Side) -> list[mi.Float]:
         """Per channel what stands beside the plane, over F_t(w_o) P_o F_t(w_i) P_i."""
         floors = [opaque(floor) for floor in self.floors]
         if self.palette is None:
@@ -95,7 +94,7 @@ class HalfSpace:
         means = self.palette.reflectance(mi.Spectrum([opaque(m.albedo) for m in self.object.media]))
         return [floor * value / dr.maximum(mean, 1e-20) for floor, value, mean in zip(floors, R, means)]
 
-    def query(self, o: SurfacePoint, i: SurfacePoint) -> tuple[tuple, Any, Any]:
+    def query(self, o: SurfacePoint, i: SurfacePoint) -> tuple[tuple[mi.Float, ...], mi.Float, mi.Bool]:
         """The query of the models, both Fresnel transmittances, and whether both directions are above the horizons."""
         query = plane_query(i, o, "distance")
         mu_i, mu_o, eta = query[1], query[3], self.object.eta
@@ -140,12 +139,12 @@ class DirectionalAlbedo:
         parts = ([arrays[:-1] for arrays in layers], [arrays[-1:] for arrays in layers])
         return tuple(Perceptron(*part, looped=True) for part in parts)
 
-    def units(self, columns: list[Any]) -> list[Any]:
+    def units(self, columns: list[mi.Float]) -> list[mi.Float]:
         """What the last layer is told of a side with these features."""
         net = self._networks[0]
         return net.numbers(net.activation(net.vector(net(columns))))
 
-    def parts(self, at: SurfacePoint, active: Any = True) -> tuple[Any, Any, Any]:
+    def parts(self, at: SurfacePoint, active: mi.Bool = True) -> tuple[mi.Spectrum, mi.Spectrum, mi.Spectrum]:
         """What passes unscattered, alpha_1 and alpha, per channel."""
         columns = side_features(self.frame, Side(at, first_event(self.object, at, active)))
         media = self.object.media
@@ -156,11 +155,11 @@ class DirectionalAlbedo:
         return tuple(dr.select(active, part, 0) for part in (enters - most, once, more))
 
     @property
-    def known(self) -> tuple[Any, Any]:
+    def known(self) -> tuple[mi.Spectrum, mi.Spectrum]:
         """See `geometry.points.ObjectAlbedo`."""
         return tuple(mi.Spectrum([opaque(float(v)) for v in row]) for row in self.trusted)
 
-    def __call__(self, at: SurfacePoint, active: Any = True) -> tuple[Any, Any]:
+    def __call__(self, at: SurfacePoint, active: mi.Bool = True) -> tuple[mi.Spectrum, mi.Spectrum]:
         """Orders zero and one, and alpha, per channel; 0 where they may not stand for uniform light."""
         unscattered, once, more = self.parts(at, active)
         few, others = self.known
@@ -204,13 +203,13 @@ class FullGeometry(Transport):
     def _h(self) -> Quadratic:
         return Quadratic(self.weights["Q"], n_side(len(self.object.media), n_local(self.object)))
 
-    def prepare(self, at: SurfacePoint, active: Any = True) -> PreparedExit:
+    def prepare(self, at: SurfacePoint, active: mi.Bool = True) -> PreparedExit:
         """The exit's side, for as many entries as are asked for."""
         side, net = self.base.end(at, active), self._network
         features, h = self._end(side)
         return PreparedExit(side, net.numbers(net.first(0, features, biased=True)), h)
 
-    def S(self, exit: PreparedExit, at: SurfacePoint, active: Any = True) -> Any:
+    def S(self, exit: PreparedExit, at: SurfacePoint, active: mi.Bool = True) -> mi.Spectrum:
         """S(x_i, w_i; x_o, w_o) per channel, 1/((scene unit)² sr); 0 below the horizons.
 
         Args:
@@ -229,7 +228,7 @@ class FullGeometry(Transport):
     def paint(self, at: SurfacePoint) -> mi.Spectrum:
         return self.base.palette.reflectance(at.medium.albedo)
 
-    def _end(self, side: Side) -> tuple[list[Any], list[Any]]:
+    def _end(self, side: Side) -> tuple[list[mi.Float], list[mi.Float]]:
         """Features of one end and what uniform light makes of them; h."""
         columns = side_features(self.frame, side)
         return [*columns, *self.alpha.units(columns)], self._h(columns)

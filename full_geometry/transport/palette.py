@@ -32,7 +32,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -50,7 +50,7 @@ from full_geometry.geometry.points import (
 from full_geometry.geometry.shape import Geometry
 from full_geometry.settings import Settings
 from full_geometry.surface.spectral import MediumByWavelength
-from full_geometry.surface.textured import MediumAt, TexturedMedium, bend, x_of_albedo
+from full_geometry.surface.textured import MediumAt, Number, TexturedMedium, bend, x_of_albedo
 from full_geometry.transport.half_space import HalfSpaceProposals, area_share, radial_table
 from halfspace_sss import measure
 from halfspace_sss.arrays import broadcast_query
@@ -296,7 +296,7 @@ class Palette:
     def _pair(self, first: BSSRDF, second: BSSRDF) -> Callable:
         """A function for S / albedo^p of two nodes, for sigma_t = 1."""
 
-        def pair(*args: Any) -> tuple[mi.Float, mi.Float]:
+        def pair(*args: mi.Float | mi.Bool) -> tuple[mi.Float, mi.Float]:
             *query, active = args
             return tuple(dr.select(active, self._over_power(m, query), 0) for m in (first, second))
 
@@ -426,7 +426,7 @@ def _pick(values: mi.Spectrum, c: mi.UInt32) -> mi.Float:
     return value
 
 
-def _albedo_of_v(v: Any, g: Any, c: Any) -> Any:
+def _albedo_of_v(v: Number, g: Number, c: Number) -> Number:
     x = v * v
     s2 = (x / (c + (1 - c) * x)) ** 2
     return (1 - s2) / (1 - g * s2)

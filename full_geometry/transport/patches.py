@@ -15,7 +15,7 @@ import functools
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -117,16 +117,16 @@ class Patches:
         }  # fmt: skip
         dr.eval(self.tables)
 
-    def row(self, key: str, k: Any) -> Any:
+    def row(self, key: str, k: mi.UInt32) -> mi.Float | mi.UInt32:
         """An entry of a table."""
         return dr.gather(type(self.tables[key]), self.tables[key], k)
 
-    def point(self, patch: Any, u_face: Any, u: Any) -> Point:
+    def point(self, patch: mi.UInt32, u_face: mi.Float, u: mi.Point2f) -> Point:
         """A uniform point of a patch."""
         low, high = self.row("start", patch), self.row("start", patch + 1)
         goal = u_face * self.row("area", patch)
 
-        def before(i: Any) -> Any:
+        def before(i: mi.UInt32) -> mi.Bool:
             i = mi.UInt32(i)
             return (i < low) | ((i + 1 < high) & (self.row("within", i) <= goal))
 
@@ -137,8 +137,8 @@ class Patches:
 class PatchWeights(NamedTuple):
     """Sums of the learnt weights of an exit up to each patch, in memory of the lane, and the last of them."""
 
-    cumulative: Any
-    total: Any
+    cumulative: dr.Local | _CumulativeRow
+    total: mi.Float
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +170,7 @@ class PatchSampler:
         for k, logit in enumerate(self._network(side_features(self.frame, exit))):
             sums[mi.UInt32(k)] = dr.minimum(logit, HIGHEST)
 
-        def add(k: Any, total: Any, sums: Any) -> tuple:
+        def add(k: mi.UInt32, total: mi.Float, sums: dr.Local) -> tuple:
             total = total + dr.exp(sums[k])
             sums[k] = total
             return k + 1, total, sums
@@ -179,12 +179,12 @@ class PatchSampler:
         _, total, sums = dr.while_loop(state, lambda k, *_: k < self.patches.n, add, label="patch weights")
         return PatchWeights(sums, total)
 
-    def sample(self, exit: PatchWeights, u_patch: Any, u_face: Any, u: Any) -> tuple[Point, Any]:
+    def sample(self, exit: PatchWeights, u_patch: mi.Float, u_face: mi.Float, u: mi.Point2f) -> tuple[Point, mi.Float]:
         """A point of entry and its density, 1/(scene unit)², for uniform numbers u_patch, u_face and the pair u."""
         patch, density = self.patch(exit, u_patch)
         return self.patches.point(patch, u_face, u), density
 
-    def patch(self, exit: PatchWeights, u: Any) -> tuple[Any, Any]:
+    def patch(self, exit: PatchWeights, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
         """A patch for a uniform number, and the density of uniform points in a patch that is drawn so."""
         learnt, last = u < LEARNT_SHARE, self.patches.n - 1
         u_1, u_2 = u / LEARNT_SHARE * exit.total, (u - LEARNT_SHARE) / (1 - LEARNT_SHARE)
@@ -193,12 +193,12 @@ class PatchSampler:
         patch = dr.select(learnt, mi.UInt32(by_weight), mi.UInt32(by_area))
         return patch, self._share(exit, patch) / self.patches.row("area", patch)
 
-    def density(self, exit: PatchWeights, face: Any) -> Any:
+    def density(self, exit: PatchWeights, face: mi.UInt32) -> mi.Float:
         """Density of `sample` on a face, 1/(scene unit)²."""
         patch = self.patches.row("patch", face)
         return self._share(exit, patch) / self.patches.row("area", patch)
 
-    def _share(self, exit: PatchWeights, patch: Any) -> Any:
+    def _share(self, exit: PatchWeights, patch: mi.UInt32) -> mi.Float:
         before = dr.select(patch > 0, exit.cumulative[dr.maximum(patch, 1) - 1], mi.Float(0))
         learnt = (exit.cumulative[patch] - before) / exit.total
         return LEARNT_SHARE * learnt + (1 - LEARNT_SHARE) * self.patches.row("share", patch)
@@ -218,10 +218,10 @@ EXITS = 4  # of a cell
 class _CumulativeRow:
     """The cumulative weights of a cell, as a lane asks for them."""
 
-    table: Any
-    start: Any
+    table: mi.Float
+    start: mi.UInt32
 
-    def __getitem__(self, k: Any) -> Any:
+    def __getitem__(self, k: mi.UInt32) -> mi.Float:
         return dr.gather(type(self.table), self.table, self.start + k)
 
 
@@ -238,7 +238,7 @@ class ExitTable:
         rows = np.cumsum(_weights(sampler, side, dr.width(exits.p)), axis=1).astype(np.float32)
         self.n, self.table, self.last = rows.shape[1], mi.Float(rows.ravel()), mi.Float(rows[:, -1].copy())
 
-    def weights(self, k: Any) -> PatchWeights:
+    def weights(self, k: mi.UInt32) -> PatchWeights:
         """Of exit k."""
         return PatchWeights(_CumulativeRow(self.table, k * self.n), dr.gather(type(self.last), self.last, k))
 
@@ -283,7 +283,7 @@ class PatchTable:
         result.table, result.last = mi.Float(rows.ravel()), mi.Float(rows[:, -1].copy())
         return result
 
-    def weights(self, face: Any) -> PatchWeights:
+    def weights(self, face: mi.UInt32) -> PatchWeights:
         """Of an exit on a face."""
         cell = dr.gather(type(self.of_face), self.of_face, face)
         return PatchWeights(_CumulativeRow(self.table, cell * self.n), dr.gather(type(self.last), self.last, cell))
@@ -317,7 +317,7 @@ class _PatchesOfExit(NamedTuple):
     """Of an exit: the weights of patches, and the axes of probes."""
 
     weights: PatchWeights | None
-    axes: tuple[Any, Any, Any]
+    axes: tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f]
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,12 +348,12 @@ class LearntProposals(CosineProposals):
         positions = replace(self.positions, points=self.positions.points.lit(brightness))
         return replace(self, positions=positions, table=table)
 
-    def prepare(self, out: SurfacePoint, prepared: PreparedExit, active: Any) -> _PatchesOfExit:
+    def prepare(self, out: SurfacePoint, prepared: PreparedExit, active: mi.Bool) -> _PatchesOfExit:
         weights = self.patches.prepare(prepared.side) if self.table is None else None
         return _PatchesOfExit(weights, (out.n_out, *mi.coordinate_system(out.n_out)))
 
     def sample(
-        self, out: SurfacePoint, prim_index: Any, prepared: _PatchesOfExit, sampler: Any, active: Any
+        self, out: SurfacePoint, prim_index: mi.UInt32, prepared: _PatchesOfExit, sampler: mi.Sampler, active: mi.Bool
     ) -> EntrySample:
         by_patch = active & (sampler.next_1d() < opaque(self.patch_share))
         weights = prepared.weights if self.table is None else self.table.weights(prim_index)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import replace
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -48,7 +47,7 @@ from full_geometry.transport.models import check_model, lookup, model_names
 from full_geometry.transport.palette import palette_model
 
 RIGID = 1e-3  # of lengths, by which instances of what is learnt may differ
-Chooser = Callable[[Any, Settings], Choices]  # says what stands for "auto" in a scene
+Chooser = Callable[["mi.Scene", Settings], Choices]  # says what stands for "auto" in a scene
 
 
 def _check_repeated(geometry: Geometry, spec: MediumSpec, settings: Settings) -> None:
@@ -66,14 +65,14 @@ def _check_repeated(geometry: Geometry, spec: MediumSpec, settings: Settings) ->
         )
 
 
-def _asked(shape: Any, settings: Settings, model: str | None = None) -> MediumSpec:
+def _asked(shape: mi.Shape, settings: Settings, model: str | None = None) -> MediumSpec:
     """What is inside an object, with the model and orders that the integrator asks for."""
     spec = surface_of(shape).spec
     asked = {"model": model or settings.model or spec.model, "orders": settings.orders or spec.orders}
     return spec if asked == {key: getattr(spec, key) for key in asked} else replace(spec, **asked)
 
 
-def choices_of(scene: Any, settings: Settings, choose: Chooser) -> Choices:
+def choices_of(scene: mi.Scene, settings: Settings, choose: Chooser) -> Choices:
     """What stands for "auto", measured if anything is."""
     specs = [_asked(shape, settings) for shape in translucent_shapes(scene)]
     if specs and (settings.light == AUTO or any(spec.model == AUTO for spec in specs)):
@@ -193,7 +192,7 @@ class TranslucentObjects:
         """What another has made by the same settings but for the light, which no model needs to know."""
         self._made, self._places = other._made, other._places
 
-    def of(self, scene: Any) -> list[TranslucentObject]:
+    def of(self, scene: mi.Scene) -> list[TranslucentObject]:
         """The objects of a scene; errors as in `make_objects`."""
         shapes = scene.shapes()  # the scene itself, which holds its integrator, would never be freed
         mark, (world, before, objects) = SceneMark(scene), self._made
@@ -213,7 +212,7 @@ class TranslucentObjects:
 
 
 def make_objects(
-    scene: Any, settings: Settings, chosen: Choices | None = None, without: Collection[str] = ()
+    scene: mi.Scene, settings: Settings, chosen: Choices | None = None, without: Collection[str] = ()
 ) -> list[TranslucentObject]:
     """All objects of a scene that have a `translucent` surface, but for those in others or with the ids in `without`.
 

@@ -503,7 +503,7 @@ def assemble(
     frame: ObjectFrame,
     base: BaseModel,
     arrays: Mapping[str, np.ndarray],
-    patches: Any = None,
+    patches: Patches | None = None,
 ) -> Learnt:
     """Model and sampler from the arrays of a file; `patches` are made from their centres if they are not given."""
 
