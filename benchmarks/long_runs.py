@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from full_geometry.trade.assessing import assess_stage
 from full_geometry.trade.results import Assessment, ObjectTrade, TechniqueTrade
@@ -25,6 +26,23 @@ STEADY = 0.15  # relative standard error of variances
 FIRST, LATER = 0.4, 0.6  # share of walks in the time of a batch
 
 
+def assessment_of(record: dict[str, Any]) -> Assessment:
+    """Read an assessment from its `record`."""
+    objects = []
+    for o in record["objects"]:
+        rows = tuple(TechniqueTrade(**{key: _known(key, value) for key, value in w.items()}) for w in o["ways"])
+        lists = {key: tuple(o[key]) for key in ("mfp", "radiance", "notes")}
+        objects.append(ObjectTrade(**{**o, **lists, "ways": rows}))
+    return Assessment(tuple(objects), record["seconds"], record["compilation"], record["seed"])
+
+
+def _known(key: str, value: object) -> object:
+    """A field of a `TechniqueTrade` from JSON."""
+    if key in ("ratio", "ratio_error"):
+        return tuple(math.nan if v is None else v for v in value)
+    return math.nan if value is None and key not in ("flip", "flip_noise") else value
+
+
 def long_run(
     on: Stage, ways: Sequence[Technique], tolerance: float, path: Path, seed: int, seconds: float
 ) -> Assessment:
@@ -36,7 +54,7 @@ def long_run(
         if how.items() <= kept.items():
             batches = kept["batches"]
     while True:
-        result = mean_of([Assessment.of(b) for b in batches]) if batches else None
+        result = mean_of([assessment_of(b) for b in batches]) if batches else None
         names = _open(result.objects[0], tolerance) if result else [way.name for way in ways]
         if result and (not names or len(batches) * BATCH >= seconds):
             return result

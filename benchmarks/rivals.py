@@ -31,7 +31,7 @@ from full_geometry.geometry.points import (
 from full_geometry.learning import model_errors
 from full_geometry.learning.model_errors import ExitTruth, RadianceError, compare, measure, reference, transport_of
 from full_geometry.learning.network_fitting import STANDARD
-from full_geometry.learning.training import train, train_by_cpu
+from full_geometry.learning.training import Trained, train, train_unattended
 from full_geometry.objects.objects import TranslucentObject, object_of
 from full_geometry.transport.exit_pairs import EntryProposals, Numbers
 from full_geometry.transport.half_space import HalfSpaceProposals
@@ -80,7 +80,7 @@ def error_table(
 
     tell("full_geometry", 0)
     with TemporaryDirectory() as folder:
-        learnt, _ = train_by_cpu(obj, seconds, folder, seed=seed)
+        learnt = train_unattended(obj, folder, cpu_seconds=seconds, seed=seed)
     proposals = EntryProposals(obj, HalfSpace(obj, BACKBONE)).with_patches(learnt.sampler)
     tell("S = alpha p", 1)
     models = {BACKBONE: transport_of(obj, BACKBONE), "full_geometry": learnt.model}
@@ -165,7 +165,7 @@ def base_model_table(
 
 def _learnt(
     obj: TranslucentObject, base_model: str, seconds: float, part: float, seed: int
-) -> tuple[Learnt, dict[str, float]]:
+) -> tuple[Trained, dict[str, float]]:
     """A training with chunks of a part of those of the recipe; what it took."""
     recipe = replace(STANDARD.with_base_model(base_model), chunk=int(STANDARD.chunk * part))
     with TemporaryDirectory() as folder:
@@ -173,9 +173,9 @@ def _learnt(
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 result = train(obj, seconds=0, recipe=recipe, seed=seed, folder=folder)
-            return Learnt(result.model, result.sampler), {"seconds": 0.0, "steps": 0}
-        learnt, path = train_by_cpu(obj, seconds, folder, seed=seed, recipe=recipe)
-        record = load_weights(path, KIND)[1]
+            return result, {"seconds": 0.0, "steps": 0}
+        learnt = train_unattended(obj, folder, cpu_seconds=seconds, seed=seed, recipe=recipe)
+        record = load_weights(learnt.path, KIND)[1]
         return learnt, {"seconds": record["seconds"], "steps": record["steps"]}
 
 

@@ -70,7 +70,7 @@ def _made(
     from benchmarks import rivals
     from benchmarks.flow_training import FlowRecipe
     from benchmarks.rivals import sampler_table
-    from full_geometry.learning.training import train_by_cpu
+    from full_geometry.learning.training import train_unattended
     from full_geometry.objects.objects import object_of
 
     def show(what: str, done: int, total: int) -> None:
@@ -80,7 +80,7 @@ def _made(
         make = {"errors": rivals.error_table, "base_models": rivals.base_model_table}[table]
         return make(scene, name, seconds=seconds, walks=samples, samples=samples, seed=seed, progress=show)
     with TemporaryDirectory() as folder:
-        learnt, _ = train_by_cpu(object_of(scene, None, None, name), seconds, folder, seed=seed)
+        learnt = train_unattended(object_of(scene, None, None, name), folder, cpu_seconds=seconds, seed=seed)
     return sampler_table(learnt, FlowRecipe(seconds=0.5 * seconds), samples=samples, seed=seed, progress=show)
 
 

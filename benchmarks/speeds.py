@@ -194,7 +194,7 @@ def scene_of(case: LitObject, way: str, size: int, folder: Path, **settings: flo
 def train(case: LitObject, seconds: float, folder: Path) -> float:
     """Learn the object, unless it has been; the CPU seconds that took."""
 
-    from full_geometry.learning.training import train_by_cpu
+    from full_geometry.learning.training import train_unattended
     from full_geometry.objects.objects import object_of
     from full_geometry.scenes.scene_files import open_scene
     from full_geometry.transport.storing import KIND, find_weights
@@ -207,7 +207,7 @@ def train(case: LitObject, seconds: float, folder: Path) -> float:
             return 0.0
         except ValueError:
             started = time.process_time()
-            train_by_cpu(learnt, seconds, folder)
+            train_unattended(learnt, folder, cpu_seconds=seconds)
             return time.process_time() - started
 
 

@@ -6,13 +6,13 @@ import json
 import math
 from pathlib import Path
 
-from benchmarks.long_runs import long_run
+from benchmarks.long_runs import assessment_of, long_run
 from benchmarks.random_scenes import RandomScene, write_scene
 from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.trade.advice import advise
 from full_geometry.trade.assessing import assess_for, learn
 from full_geometry.trade.automatic import picked
-from full_geometry.trade.results import Assessment, TechniqueTrade
+from full_geometry.trade.results import TechniqueTrade
 from full_geometry.trade.statistics import seeded
 from full_geometry.trade.techniques import Effort, Job, Stage, Technique, stage
 from halfspace_sss.neural.store import weights_in
@@ -60,7 +60,7 @@ def _quick(scene: RandomScene, on: Stage, ways: list[Technique], path: Path, sec
 def outcome(record: dict[str, object]) -> dict[str, object]:
     """What came of a scene: error and cost of the recommendation by the long runs, and those of the cheapest way."""
     scene = RandomScene(**{k: tuple(v) if isinstance(v, list) else v for k, v in record["scene"].items()})
-    quick, long = (Assessment.of(record[key]) for key in ("quick", "long"))
+    quick, long = (assessment_of(record[key]) for key in ("quick", "long"))
     results: dict[str, object] = {"number": scene.number, "shape": scene.shape, "light": scene.light, "mfp": scene.mfp}
     results |= {"tolerance": scene.tolerance, "images": scene.images, "seconds": quick.seconds}
     if not quick.objects[0].ways or quick.objects[0].is_dark:
@@ -100,7 +100,7 @@ def _least(row: TechniqueTrade, scene: RandomScene, pixels: float) -> float:
 
 def z_values(record: dict[str, object]) -> list[tuple[str, float]]:
     """(bias² of the assessment - that of the long run) over their standard errors together, for each way."""
-    quick, long = (Assessment.of(record[key]) for key in ("quick", "long"))
+    quick, long = (assessment_of(record[key]) for key in ("quick", "long"))
     results = []
     for a in quick.objects[0].ways:
         if a.refusal or a.way == PATH_TRACED:

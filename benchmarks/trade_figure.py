@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from benchmarks.closed_shapes import write_shape
+from benchmarks.long_runs import assessment_of
 from benchmarks.trade_tables import markdown, multiples, trade_table
 from figures.computing.contenders import OF_OBJECTS
 from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training_of, weight_files, with_weights
@@ -20,7 +21,6 @@ from figures.drawing.trade_plot import image_shots
 from figures.parts.part import Part, Result, Task
 from figures.parts.records import Params, SceneDict
 from full_geometry.scenes.scene_files import PATH_TRACED
-from full_geometry.trade.results import Assessment
 from full_geometry.trade.techniques import GATHERED, LAMBERT, Technique
 from halfspace_sss import materials
 from halfspace_sss.comparison.style import paper, saved
@@ -154,7 +154,7 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
         name = _name(*scene)
         if name not in results:
             continue
-        assessment = Assessment.of(results[name].numbers["assessment"])
+        assessment = assessment_of(results[name].numbers["assessment"])
         result[scene] = assessment.objects[0]
         shown = enumerate(results[name].numbers["shown"])
         images = {way: np.asarray(results[name].images[f"image_{k}"]) for k, way in shown}

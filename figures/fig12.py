@@ -72,14 +72,14 @@ def _key(*words: object) -> str:
 
 def _weights(task: Task) -> dict[str, Path]:
     """A folder of weights for each sampler, of one training, without patches and with them."""
-    from full_geometry.learning.training import train_by_cpu
+    from full_geometry.learning.training import train_unattended
     from full_geometry.objects.objects import object_of
     from full_geometry.transport.storing import CENTRES, KIND
     from halfspace_sss.neural.store import load_weights, save_weights
 
     p, folders = task.params, {name: task.folder / name for name in SAMPLERS}
     obj = object_of(*shape_of("bunny", task.folder))
-    _, path = train_by_cpu(obj, p["seconds"], folders["patches"], seed=p["seed"])
+    path = train_unattended(obj, folders["patches"], cpu_seconds=p["seconds"], seed=p["seed"]).path
     arrays, record = load_weights(path, KIND)
     of_patches = {CENTRES} | {name for name in arrays if name.startswith(("V_", "c_"))}
     bare = {name: value for name, value in arrays.items() if name not in of_patches}

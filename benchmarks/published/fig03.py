@@ -45,7 +45,7 @@ def parts(quality: str) -> list[Part]:
 def sampled(task: Task) -> dict[str, object]:
     """Points in the object's frame over its radius, their RMSD to the nearest barycentre, and light where they are."""
     from benchmarks.published.paper_flow import fit_space_flow, mesh_arrays, on_surface, rmsd
-    from full_geometry.learning.training import train_by_cpu
+    from full_geometry.learning.training import train_unattended
     from full_geometry.objects.objects import object_of
     from full_geometry.transport.storing import frame_of
 
@@ -53,7 +53,7 @@ def sampled(task: Task) -> dict[str, object]:
     p, n = task.params, task.params["points"]
     scene = _lit(p["object"], task, p["resolution"], p["seed"])
     obj = object_of(scene)
-    learnt, _ = train_by_cpu(obj, p["seconds"], task.folder, seed=p["seed"])
+    learnt = train_unattended(obj, task.folder, cpu_seconds=p["seconds"], seed=p["seed"])
     task.progress(1, 4)
     frame = frame_of(obj)
     vertices, faces = mesh_arrays(obj, frame)

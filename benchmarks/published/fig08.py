@@ -68,7 +68,7 @@ def _rmse(result: ExitRadiance, truth: ExitTruth, per_estimate: float) -> dict[s
 def ours(task: Task) -> dict[str, object]:
     """Errors of `full_geometry` with N entries by patches."""
     from full_geometry.learning.model_errors import modelled
-    from full_geometry.learning.training import train_by_cpu
+    from full_geometry.learning.training import train_unattended
     from full_geometry.objects.objects import object_of
     from full_geometry.transport.exit_pairs import EntryProposals
     from full_geometry.transport.one_object import HalfSpace
@@ -76,7 +76,7 @@ def ours(task: Task) -> dict[str, object]:
     prepare()
     p = task.params
     obj = object_of(*shape_of("bunny", task.folder))
-    learnt, _ = train_by_cpu(obj, p["seconds"], task.folder, seed=p["seed"])
+    learnt = train_unattended(obj, task.folder, cpu_seconds=p["seconds"], seed=p["seed"])
     truth = truth_of(obj, p)
     proposals = EntryProposals(obj, HalfSpace(obj, BACKBONE)).with_patches(learnt.sampler)
     result = modelled(learnt.model, proposals, truth.exits, p["walks"], p["seed"])

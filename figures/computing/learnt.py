@@ -78,7 +78,7 @@ def train_scan(name: str, material: str, chunks: int, seed: int = 0, scan: str =
     Args:
         name: of what is learnt, by which `training_of` finds it.
         material: in the registry.
-        chunks: see `full_geometry.learning.training.train_by_chunks`.
+        chunks: see `full_geometry.learning.training.train_unattended`.
         seed: of the training.
         scan: name in `scenes.SCANS`.
     """
@@ -132,7 +132,7 @@ def trained(task: Task, scene: SceneDict, name: str) -> dict[str, object]:
 
     The parameters "chunks" and "seed" of the task are those of the training.
     """
-    from full_geometry.learning.training import train_by_chunks
+    from full_geometry.learning.training import train_unattended
     from full_geometry.objects.objects import object_of
     from full_geometry.scenes.scene_files import open_scene
     from full_geometry.transport.storing import KIND
@@ -140,7 +140,8 @@ def trained(task: Task, scene: SceneDict, name: str) -> dict[str, object]:
 
     obj = object_of(open_scene(scene, KIND), None, None, name)
     started, of_cpu = time.perf_counter(), time.process_time()
-    _, path = train_by_chunks(obj, task.params["chunks"], task.folder / "weights", seed=task.params["seed"])
+    p = task.params
+    path = train_unattended(obj, task.folder / "weights", chunks=p["chunks"], seed=p["seed"]).path
     took = {"seconds": time.perf_counter() - started, "cpu seconds": time.process_time() - of_cpu}
     record = load_weights(path, KIND)[1]
     files = {file.name: file.read_bytes() for file in (path, path.with_suffix(".json"))}

@@ -303,32 +303,29 @@ def train(
     return run.go(how.seconds, how.chunks, how.target_error, folder, progress)
 
 
-def train_by_cpu(
-    obj: TranslucentObject, seconds: float, folder: str | Path, *, seed: int = 0, recipe: Recipe = STANDARD
-) -> tuple[storing.Learnt, Path]:
-    """Learn an object in so many seconds of CPU time, whatever else the machine does; its errors take more.
+def train_unattended(
+    obj: TranslucentObject,
+    folder: str | Path,
+    *,
+    cpu_seconds: float = 0.0,
+    chunks: int | None = None,
+    seed: int = 0,
+    recipe: Recipe = STANDARD,
+) -> Trained:
+    """Learn an object without errors on the way, in seconds of CPU time whatever else the machine does, or by chunks.
 
     Args:
         obj: the object.
-        seconds: of CPU time of this process, for data and fit.
         folder: for the weights.
+        cpu_seconds: of this process, for data and fit; errors at the end take more.
+        chunks: instead, each of `recipe.chunk` walks that are kept, so that the clock has no part in the weights.
         seed, recipe: of everything; sizes and rates.
     """
-    check_interval("seconds", seconds, 1e-3, 1e7)
-    return _ObjectTraining(obj, recipe, seed, None, None).unattended(folder, seconds, None)
-
-
-def train_by_chunks(
-    obj: TranslucentObject, chunks: int, folder: str | Path, *, seed: int = 0, recipe: Recipe = STANDARD
-) -> tuple[storing.Learnt, Path]:
-    """Learn an object by so many chunks of data, so that the clock has no part in the weights.
-
-    Args:
-        obj, folder, seed, recipe: as in `train_by_cpu`.
-        chunks: each of `recipe.chunk` walks that are kept.
-    """
-    check_count("chunks", chunks, 1)
-    return _ObjectTraining(obj, recipe, seed, None, None).unattended(folder, 0.0, chunks)
+    if chunks is None:
+        check_interval("cpu_seconds", cpu_seconds, 1e-3, 1e7)
+    else:
+        check_count("chunks", chunks, 1)
+    return _ObjectTraining(obj, recipe, seed, None, None).unattended(folder, cpu_seconds, chunks)
 
 
 class _ObjectTraining:
@@ -398,20 +395,23 @@ class _ObjectTraining:
         self.fitting.solve(self.source, self.done, self.seed)
         errors = self._judged(truth, 2 * WALKS)
         self._save_camera()
-        record = self._record(errors, clock() - began)  # of all cores, as the trade counts
-        path = storing.save(folder, self.identity, self.arrays(), record)
-        return Trained(*self.learnt(), path, errors, self.fitting.step, time.monotonic() - started)
+        return self._written(folder, errors, clock() - began, started)  # of all cores, as the trade counts
 
-    def unattended(self, folder: str | Path, seconds: float, chunks: int | None) -> tuple[storing.Learnt, Path]:
+    def unattended(self, folder: str | Path, seconds: float, chunks: int | None) -> Trained:
         """Without errors on the way: for CPU seconds, or a number of chunks in place of a plan by them."""
-        began = clock()
+        started, began = time.monotonic(), clock()
         self._prepare(chunks)
         while self.done < self.total:
             self._chunk(seconds, time.process_time)
         self.fitting.solve(self.source, self.done, self.seed)
         spent = clock() - began
-        record = self._record(self._judged(reference(self.object, EXITS, WALKS, self.seed), SAMPLES), spent)
-        return self.learnt(), storing.save(folder, self.identity, self.arrays(), record)
+        errors = self._judged(reference(self.object, EXITS, WALKS, self.seed), SAMPLES)
+        return self._written(folder, errors, spent, started)
+
+    def _written(self, folder: str | Path, errors: list[RadianceError], spent: float, started: float) -> Trained:
+        """The result, with its weights in a file, whose record says how many seconds were spent on the fit."""
+        path = storing.save(folder, self.identity, self.arrays(), self._record(errors, spent))
+        return Trained(*self.learnt(), path, errors, self.fitting.step, time.monotonic() - started)
 
     def _prepare(self, chunks: int | None = None) -> None:
         """Scales and shares from a pilot, which compiles all kernels; the work of a run that was killed."""

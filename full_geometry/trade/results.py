@@ -183,16 +183,6 @@ class Assessment:
         """Ready for JSON; what is not known is None there."""
         return plain(asdict(self))
 
-    @classmethod
-    def of(cls, record: dict[str, Any]) -> Assessment:
-        """Read an assessment from a `record`."""
-        objects = []
-        for o in record["objects"]:
-            rows = tuple(TechniqueTrade(**{key: _known(key, value) for key, value in w.items()}) for w in o["ways"])
-            lists = {key: tuple(o[key]) for key in ("mfp", "radiance", "notes")}
-            objects.append(ObjectTrade(**{**o, **lists, "ways": rows}))
-        return cls(tuple(objects), record["seconds"], record["compilation"], record["seed"])
-
 
 def plain(value: object) -> object:
     """Without nan, which JSON has not."""
@@ -201,13 +191,6 @@ def plain(value: object) -> object:
     if isinstance(value, (list, tuple)):
         return [plain(v) for v in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _known(key: str, value: object) -> object:
-    """A field of a `TechniqueTrade` from JSON."""
-    if key in ("ratio", "ratio_error"):
-        return tuple(math.nan if v is None else v for v in value)
-    return math.nan if value is None and key not in ("flip", "flip_noise") else value
 
 
 def html_table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -302,10 +302,6 @@ KIND = "full_geometry"
 CHECKSUMS = "start_checksums"  # of a record
 CENTRES, TRUSTED, TURNS, ENDS = "centres", "even", "turns", "Q"
 S_LAYERS, ALPHA_LAYERS, PATCH_LAYERS = ("W_", "b_", ENDS), ("A_", "a_"), ("V_", "c_")
-NEEDED = (
-    (TRUSTED, "directional albedo must be learnt"), (TURNS, "turns of the surroundings of a point must be known"),
-    (ENDS, "functions of ends must be solved for"),
-)  # fmt: skip
 
 
 class Learnt(NamedTuple):
@@ -424,9 +420,8 @@ def _trained(path: Path) -> tuple[Identity, dict[str, np.ndarray], dict[str, Any
     if record.get("reflections") != REFLECTIONS:
         known = f"reflections must be {REFLECTIONS}, got {record.get('reflections')}"
         raise ValueError(f"{path.with_suffix('.json')}: {known}: of another version, to be trained again")
-    for name, what in NEEDED:
-        if name not in arrays:
-            raise ValueError(f"{path}: {what}, got none: of another version, to be trained again")
+    if missing := sorted({TRUSTED, TURNS, ENDS} - arrays.keys()):
+        raise ValueError(f"{path}: arrays must hold {', '.join(missing)}, got none: to be trained again")
     try:
         anchors, grids = arrays.pop("anchors"), record.get("grids", "")
         probes = arrays.pop("probes") if grids else None
@@ -444,8 +439,7 @@ def _checked_base(path: Path, record: dict[str, Any], obj: TranslucentObject) ->
     """Name of the model that weights multiply; ValueError if they were fitted to others of it than are here now."""
     place = path.with_suffix(".json")
     try:
-        recipe, fitted = record["recipe"], tuple(record[CHECKSUMS])
-        name = recipe["base_model"] if "base_model" in recipe else recipe["start"]  # its name before
+        name, fitted = record["recipe"]["base_model"], tuple(record[CHECKSUMS])
     except (KeyError, TypeError) as error:
         raise ValueError(f"{place}: base_model must be recorded: of another version, to be trained again") from error
     if fitted != base_checksums(obj, name):

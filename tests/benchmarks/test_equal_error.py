@@ -43,9 +43,9 @@ def _computed(part: Part, done: dict[str, Result], folder: Path) -> Result:
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Result]:
     """All parts of one material under the sky, small."""
-    train = training.train_by_chunks
+    train = training.train_unattended
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(training, "train_by_chunks", lambda *a, **how: train(*a, **{**how, "recipe": QUICK}))
+        patch.setattr(training, "train_unattended", lambda *a, **how: train(*a, **{**how, "recipe": QUICK}))
         patch.setitem(equal_error.CHUNKS, "draft", 1)
         patch.setattr(equal_error, "SUBJECTS", {"ketchup": ("bunny", "ketchup")})
         patch.setitem(equal_error.COMPARED, "draft", {"ketchup": ("even sky",)})

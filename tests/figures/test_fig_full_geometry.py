@@ -46,8 +46,8 @@ SETTINGS = {
 
 @pytest.fixture()
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    train = training.train_by_chunks
-    monkeypatch.setattr(training, "train_by_chunks", lambda *a, **how: train(*a, **{**how, "recipe": QUICK}))
+    train = training.train_unattended
+    monkeypatch.setattr(training, "train_unattended", lambda *a, **how: train(*a, **{**how, "recipe": QUICK}))
     for module, settings in SETTINGS.items():
         monkeypatch.setitem(module.CHUNKS, "draft", 1)
         for name, value in settings.items():

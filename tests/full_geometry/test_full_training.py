@@ -30,7 +30,7 @@ from full_geometry.learning.model_errors import (  # noqa: E402  # noqa: E402
     transport_of,
 )
 from full_geometry.learning.network_fitting import Correction, Recipe  # noqa: E402
-from full_geometry.learning.training import Trained, train, train_by_chunks  # noqa: E402
+from full_geometry.learning.training import Trained, train, train_unattended  # noqa: E402
 from full_geometry.objects.objects import object_of  # noqa: E402
 from full_geometry.transport import storing  # noqa: E402
 from full_geometry.transport.exit_pairs import EntryProposals  # noqa: E402
@@ -114,7 +114,7 @@ def test_weights_of_a_number_of_chunks_are_the_same_bits_by_one_thread_and_by_th
     for threads in (1, 3):
         dr.set_thread_count(threads)
         try:
-            _, path = train_by_chunks(object_of(ball(), WAX), 2, tmp_path / str(threads), recipe=FEW)
+            path = train_unattended(object_of(ball(), WAX), tmp_path / str(threads), chunks=2, recipe=FEW).path
         finally:
             dr.set_thread_count(before)
         found.append(path.read_bytes())

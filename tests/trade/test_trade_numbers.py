@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from benchmarks.long_runs import assessment_of
 from full_geometry.cli import trade
 from full_geometry.integrators.gathering import PART, Gathered, Gathering
 from full_geometry.trade import recommend
@@ -301,7 +302,7 @@ def test_the_noise_of_precomputed_light_is_told_by_two_parts_and_is_no_bias() ->
 
 def test_a_record_comes_back_as_it_was() -> None:
     found = _assessment(CHEAP, GOOD)
-    assert Assessment.of(found.record()) == found
+    assert assessment_of(found.record()) == found
 
 
 @pytest.mark.parametrize(
