@@ -13,7 +13,7 @@ from figures.computing.images import Shot, compared
 from figures.drawing.page import page
 from full_geometry.trade.images import TradePicture
 from full_geometry.trade.results import Assessment, ObjectTrade, TechniqueTrade
-from full_geometry.trade.techniques import GATHERED, NO_SINGLE
+from full_geometry.trade.techniques import GATHERED
 from halfspace_sss.comparison.style import TEXT, TRACED, Look, look, paper, saved
 
 NOISE = 0.01  # of the mean radiance, to which times are
@@ -63,8 +63,7 @@ def trade_panels(assessed: ObjectTrade, left: Axes, right: Axes, tolerance: floa
 def _look(way: str) -> Look:
     model, *more = way.split(", ")
     style = look(model)
-    words = ["no single" if part == NO_SINGLE else part for part in more]
-    return style._replace(label=", ".join([style.label, *words]))
+    return style._replace(label=", ".join([style.label, *more]))
 
 
 def time_to_noise(row: TechniqueTrade, pixels: float) -> float:
@@ -80,11 +79,10 @@ def pareto(
     for row in rows:
         style, x, exact = _look(row.way), time_to_noise(row, pixels), row.way == TRACED
         y = LEAST if exact else max(row.bias, LEAST)
-        bare = row.way.endswith(NO_SINGLE)
         mark = "s" if row.way.endswith(GATHERED) else MARKERS.get(row.way, "o")
         size = (9 if exact else 5) * (0.7 if small else 1)
         (handle,) = ax.plot(
-            x, y, mark, color=style.color, mfc="white" if bare else style.color, ms=size, mew=0.7 if small else 0.9,
+            x, y, mark, color=style.color, mfc=style.color, ms=size, mew=0.7 if small else 0.9,
             ls="none", zorder=3, clip_on=False, label=style.label,
         )  # fmt: skip
         handles[style.label] = handle
@@ -128,7 +126,7 @@ def _overtime_to_noise(ax: Axes, rows: Sequence[TechniqueTrade], pixels: float, 
     traced = next(w for w in rows if w.way == TRACED)
     middle = traced.variance * traced.seconds * pixels / tolerance**2
     times = np.geomspace(middle / 300, middle * 30, 200)
-    for row in (w for w in rows if not w.way.endswith(NO_SINGLE)):
+    for row in rows:
         style = _look(row.way)
         floor, slope = (0.0 if row is traced else row.bias**2), row.variance * row.seconds * pixels
         width = 1.6 if row is traced else 1.0

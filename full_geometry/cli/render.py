@@ -41,7 +41,6 @@ class UntilOptions:
     seconds: Annotated[float | None, typer.Option(help="Stop after this time of rendering.")] = None
 
     def limits(self) -> Limits:
-        """As `scenes.reference` takes it."""
         from full_geometry.scenes.reference import Limits
 
         spp = SPP if (self.spp, self.target_error, self.seconds) == (None,) * 3 else self.spp
@@ -79,7 +78,6 @@ class TransportOptions:
         return {name: value for name, value in given.items() if value is not None}
 
     def training(self) -> dict[str, float]:
-        """As `learning.online.render` takes it."""
         return {"train_seconds": self.train_seconds, "train_error": self.train_error}
 
 
@@ -299,7 +297,6 @@ def _numbers(reference: Reference) -> dict[str, str]:
 
 
 def _error(reference: Reference) -> str:
-    """What is known of the error of an image."""
     if not reference.mean[..., :3].any():
         return "every pixel is black: no light reaches the camera"
     if reference.passes < 2:

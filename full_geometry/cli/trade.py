@@ -161,7 +161,6 @@ def _scene(
 
 
 def object_table(assessed: ObjectTrade) -> Table:
-    """All ways of rendering an object."""
     from full_geometry.trade.results import UNNAMED
 
     low, high = assessed.mfp

@@ -155,7 +155,6 @@ def errors_object(
 
 
 def object_table(rows: Sequence[ObjectError]) -> Table:
-    """Errors of models of an object."""
     headings = ("object", "channel", "model", "light", "error", "standard error", "mean / traced mean")
     cells = [
         (

@@ -410,13 +410,11 @@ class InstanceProposals:
     transform: InstanceTransform
 
     def prepare(self, out: SurfacePoint, prepared: Any, active: mi.Bool) -> Any:
-        """Prepare the proposals at the exit in the frame of the group."""
         return self.proposals.prepare(self.transform.surface_point_to_object(out), prepared, active)
 
     def sample(
         self, out: SurfacePoint, prim_index: mi.UInt32, prepared: Any, sampler: mi.Sampler, active: mi.Bool
     ) -> EntrySample:
-        """Draw an entry in the frame of the group, and move it to the scene."""
         return self.transform.entry_to_world(
             self.proposals.sample(self.transform.surface_point_to_object(out), prim_index, prepared, sampler, active)
         )
@@ -426,7 +424,6 @@ class InstanceProposals:
         return self.proposals.sample_direction(entry, out, u)
 
     def pdf_direction(self, entry: EntrySample, out: SurfacePoint, w_i: mi.Vector3f) -> mi.Float:
-        """The density of `sample_direction`, 1/sr."""
         return self.proposals.pdf_direction(entry, out, w_i)
 
 
@@ -445,11 +442,9 @@ class InstanceTransport(TransportAround):
         return None if self.transport.alpha is None else InstanceAlbedo(self.transport.alpha, self.transform)
 
     def prepare(self, at: SurfacePoint, active: mi.Bool = True) -> Any:
-        """Prepare the transport at the exit in the frame of the group."""
         return self.transport.prepare(self.transform.surface_point_to_object(at), active)
 
     def S(self, exit: Any, at: SurfacePoint, active: mi.Bool = True) -> mi.Spectrum:
-        """S of the transport for the entry in the frame of the group."""
         return self.transport.S(exit, self.transform.surface_point_to_object(at), active)
 
 
@@ -465,5 +460,4 @@ class InstanceAlbedo:
         return self.alpha.known
 
     def __call__(self, at: SurfacePoint, active: mi.Bool) -> tuple[mi.Spectrum, mi.Spectrum]:
-        """The directional albedo at the exit in the frame of the group."""
         return self.alpha(self.transform.surface_point_to_object(at), active)

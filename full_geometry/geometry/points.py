@@ -76,7 +76,6 @@ class SurfacePoint(NamedTuple):
         return dr.select(dr.dot(self.w, self.n) > 0, dr.maximum(dr.dot(self.w, self.n_out), 0), 0)
 
     def gather(self, k: mi.UInt32) -> SurfacePoint:
-        """The points of the lanes k."""
         return SurfacePoint(*(v if isinstance(v, (float, tuple)) else dr.gather(type(v), v, k) for v in self))
 
 
@@ -295,7 +294,6 @@ class EntrySample(NamedTuple):
     medium: MediumAt | tuple[()] = ()
 
     def gather(self, k: mi.UInt32) -> EntrySample:
-        """The entries of the lanes k."""
         return EntrySample(*(v if isinstance(v, tuple) else dr.gather(type(v), v, k) for v in self))
 
     def facing(self, w: mi.Vector3f) -> SurfacePoint:
@@ -450,7 +448,6 @@ class PositionSampler:
 
     @property
     def probes(self) -> int:
-        """Number of probes."""
         return int(self.area_share < 1)
 
     def _side(self, out: SurfacePoint, prim_index: mi.UInt32, active: mi.Bool) -> mi.Float:

@@ -207,7 +207,6 @@ class Geometry:
 
     @property
     def name(self) -> str:
-        """The name of the shape in messages."""
         return name_of(self.shape)
 
     def is_current(self) -> bool:
@@ -238,7 +237,6 @@ class Geometry:
     def ray_intersect(
         self, ray: mi.Ray3f, flags: int, coherent: bool = False, active: mi.Bool | bool = True
     ) -> mi.SurfaceInteraction3f:
-        """Intersect a ray with the shape alone, as `mi.Scene.ray_intersect`."""
         if self.group is None:
             return self.scene.ray_intersect(ray, flags, coherent, active)
         if self.transform is None:
@@ -249,7 +247,6 @@ class Geometry:
         return completed(si, si, ray, flags, active & si.is_valid())
 
     def ray_test(self, ray: mi.Ray3f, coherent: bool = False, active: mi.Bool | bool = True) -> mi.Bool:
-        """Whether a ray meets the shape."""
         return self.scene.ray_test(
             ray if self.transform is None else self.transform.ray_to_object(ray), coherent, active
         )
@@ -369,7 +366,6 @@ class _Votes:
         self.opposed = dr.zeros(mi.Float, 1)
 
     def add(self, si: mi.SurfaceInteraction3f, along: mi.Vector3f, entering: mi.Bool, active: mi.Bool) -> None:
-        """Count a hit."""
         dr.scatter_add(self.opposed, mi.Float(1), 0, active & (dr.dot(si.sh_frame.n, si.n) < 0))
         if self.pieces is None:
             return

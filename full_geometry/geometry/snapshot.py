@@ -107,21 +107,21 @@ def scene_hash(scene: mi.Scene, integrator: mi.Integrator) -> str:
     return hashlib.sha256("\n".join([*result, words(integrator)]).encode()).hexdigest()
 
 
+def held(holder: mi.Object) -> list[tuple[str, object]]:
+    """Names and values of the objects and parameters that an object of Mitsuba holds."""
+    found = []
+
+    class Listing(mi.TraversalCallback):
+        def put(self, name: str, value: object, *flags: object) -> None:
+            found.append((name, value))
+
+    holder.traverse(Listing())
+    return found
+
+
 def children(holder: mi.Object) -> list[mi.Object]:
     """The objects that stand in a scene or in another object, in any order."""
-
-    class Children(mi.TraversalCallback):
-        def __init__(self) -> None:
-            mi.TraversalCallback.__init__(self)
-            self.found: list[mi.Object] = []
-
-        def put(self, name: str, value: object, flags: object, cpptype: object = None) -> None:
-            if isinstance(value, mi.Object):
-                self.found.append(value)
-
-    callback = Children()
-    holder.traverse(callback)
-    return callback.found
+    return [value for _, value in held(holder) if isinstance(value, mi.Object)]
 
 
 def object_digest(node: mi.Object) -> str:

@@ -91,7 +91,6 @@ class FitStep(NamedTuple):
     values: dict[str, list[float]]
 
     def line(self) -> str:
-        """A line for the progress."""
         numbers = "; ".join(f"{name} {' '.join(f'{v:.4g}' for v in value)}" for name, value in self.values.items())
         return f"loss {self.loss:.3g} ± {self.error:.1g}  {numbers}"
 
@@ -274,7 +273,6 @@ class ViewComparison:
         return self.factors / np.exp(np.log(self.factors[self.fitted]).mean())
 
     def batch(self, k: int) -> list[int]:
-        """The views of a step."""
         n = min(self.settings.batch or BATCH, len(self.fitted))
         return np.random.default_rng([self.settings.seed, k]).permutation(self.fitted)[:n].tolist()
 
@@ -284,7 +282,6 @@ class ViewComparison:
         return max(float(view.counts.sum() * view.image.shape[2]), 1.0)
 
     def seed(self, k: int, which: int, purpose: str, parameter: int = 0) -> int:
-        """The seed of a render in step k."""
         words = [self.settings.seed, k, which, PURPOSES.index(purpose), parameter]
         return int(np.random.SeedSequence(words).generate_state(1)[0])
 

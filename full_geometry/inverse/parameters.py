@@ -132,7 +132,6 @@ class FitParameters:
         return result
 
     def bounds(self, name: str) -> tuple[float, float]:
-        """The bounds of a variable."""
         if name == "albedo":
             return tuple(float(np.log(a / (1 - a))) for a in ALBEDO)
         if name == "g":
@@ -159,7 +158,6 @@ class FitParameters:
         return result
 
     def put(self, x: dict[str, mi.Float | mi.Spectrum]) -> None:
-        """Set the medium of the object."""
         surface, values = surface_of(self.shape), self.values(x)
         for name, value in values.items():
             setattr(surface, name, value)

@@ -93,7 +93,6 @@ class Variable:
 
     @property
     def is_texture(self) -> bool:
-        """Whether it is no constant."""
         return self.start.ndim > 1
 
     @property
@@ -116,13 +115,11 @@ class Variable:
         return np.log(np.clip(v, low, high))
 
     def clipped(self, x: np.ndarray) -> np.ndarray:
-        """Variables within their bounds."""
         if self.name in LAST:
             return np.clip(x, -LAST[self.name] - 1, LAST[self.name] + 1)
         return np.clip(x, *map(np.log, self._ends()))
 
     def parameter(self, x: np.ndarray) -> np.ndarray:
-        """The parameter of variables."""
         low, high = self._ends()
         if self.name in ("albedo", "reflectance"):
             return low + (high - low) / (1 + np.exp(-x))

@@ -146,7 +146,6 @@ class ObjectLearner:
         return [row for model, rows in by_model.items() for row in _rows(name, model, rows)]
 
     def cost(self, scene: mi.Scene, object: str) -> float:
-        """As `Learner.cost`."""
         path = find_weights(object_of(scene, None, None, object))
         return float(load_weights(path, KIND)[1].get("seconds", 0.0))
 

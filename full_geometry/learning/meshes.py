@@ -209,7 +209,6 @@ class Mesh:
 
     @property
     def areas(self) -> np.ndarray:
-        """The area of each triangle, mm²."""
         a, b, c = np.moveaxis(self.vertices[self.faces], 1, 0)
         return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
@@ -347,7 +346,6 @@ def margin(low: np.ndarray, high: np.ndarray) -> Box:
 
 
 def turned_points(p: np.ndarray, angles: np.ndarray) -> np.ndarray:
-    """Points turned about x, y and z."""
     for axis, angle in enumerate(angles):
         p = rotated(p, axis, angle)
     return p

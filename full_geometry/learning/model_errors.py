@@ -29,9 +29,10 @@ from full_geometry.transport.exit_pairs import EntryProposals, trace_exits
 from full_geometry.transport.half_space import HalfSpaceTransport
 from full_geometry.transport.models import lookup
 from full_geometry.transport.one_object import HalfSpace
-from full_geometry.transport.patches import ExitTable
+from full_geometry.transport.patches import WeightTable
 from full_geometry.transport.storing import KIND, find_weights, load
 from halfspace_sss.checks import check_count
+from halfspace_sss.noise_free import NoiseFree
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.registry import bssrdf
@@ -80,7 +81,6 @@ class _Sums:
 
 
 def _passes(n_exits: int, per_exit: int) -> list[int]:
-    """Samples of each exit in each pass."""
     most = max(LANES // n_exits, 1)
     return [min(most, per_exit - done) for done in range(0, per_exit, most)]
 
@@ -127,7 +127,7 @@ def modelled(
     """
     n = dr.width(exits.p)
     sums = _Sums(n)
-    table = ExitTable(proposals.patches, exits) if proposals.patches else None
+    table = WeightTable.of(proposals.patches, exits) if proposals.patches else None
     for k, per_exit in enumerate(_passes(n, samples)):
         points, lanes = _repeated(exits, per_exit), dr.arange(mi.UInt32, n * per_exit)
         rng = generator(mi, n * per_exit, pass_seed(seed, 19, k))
@@ -168,11 +168,12 @@ def of_uniform_light(model: ExitRadiance, truth: ExitRadiance) -> list[RadianceE
 def _error(c: int, light: str, columns: slice, model: ExitRadiance, truth: ExitRadiance) -> RadianceError:
     a, b = model.mean[c][:, columns], truth.mean[c][:, columns]
     square = (a - b) ** 2 - model.variance[c][:, columns] - truth.variance[c][:, columns]
-    return RadianceError(c, light, *_jackknife(square, b), float(a.mean() / max(b.mean(), 1e-300)))
+    off = _jackknife(square, b)
+    return RadianceError(c, light, off.value, off.standard_error, float(a.mean() / max(b.mean(), 1e-300)))
 
 
-def _jackknife(square: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
-    """Error and standard error from the squared errors (exits, lights) and the truth."""
+def _jackknife(square: np.ndarray, truth: np.ndarray) -> NoiseFree:
+    """The error from the squared errors (exits, lights) and the truth."""
     n = len(square)
 
     def ratio(sums: np.ndarray, means: np.ndarray) -> np.ndarray:
@@ -180,9 +181,7 @@ def _jackknife(square: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
 
     whole = float(ratio(square.mean(0), truth.mean(0)))
     parts = ratio((square.sum(0) - square) / (n - 1), (truth.sum(0) - truth) / (n - 1))
-    spread = float(np.sqrt((n - 1) * np.mean((parts - parts.mean()) ** 2)))
-    error = float(np.sqrt(max(whole, 0.0)))
-    return error, spread / (2 * max(error, np.sqrt(spread), 1e-12))
+    return NoiseFree(whole, float(np.sqrt((n - 1) * np.mean((parts - parts.mean()) ** 2))))
 
 
 def measure(

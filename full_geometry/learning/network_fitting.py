@@ -303,7 +303,6 @@ class ObjectFit:
 
     @property
     def step(self) -> int:
-        """Steps that were taken."""
         return self.descent.steps
 
     def set_scale(self, walks: Pairs) -> None:

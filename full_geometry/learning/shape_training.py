@@ -119,7 +119,6 @@ class ShapeNetwork(nn.Module):
         return bound * torch.tanh(g / bound)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Matrices (outputs, inputs) and biases by name."""
         arrays = {f"W_{k}": W.detach().numpy().copy() for k, W in enumerate(self.matrices)}
         return arrays | {f"b_{k}": b.detach().numpy().copy() for k, b in enumerate(self.biases)}
 
@@ -148,7 +147,6 @@ class ShapeFit:
 
     @property
     def step(self) -> int:
-        """Steps that were taken."""
         return self.descent.steps
 
     def advance(self, pool: list[GroupedPairs], rng: np.random.Generator, part: float) -> float:
@@ -252,8 +250,6 @@ def train_shapes(
 
 
 class _ShapeTraining:
-    """A training on its way."""
-
     def __init__(self, recipe: ShapeRecipe, seed: int, meshes: list[Path], work: Path | None) -> None:
         self.recipe, self.seed, self.meshes, self.work = recipe, seed, meshes, work
         self.fitting = ShapeFit(recipe, seed)
@@ -383,7 +379,6 @@ class Drawn:
     object: TranslucentObject
 
     def record(self) -> dict[str, Any]:
-        """The object as JSON has it."""
         m = self.object.media[0]
         size = float(self.object.mean_free_paths()[0])
         return {"family": self.family, "size_in_mfp": size, "albedo": float(m.albedo), "g": float(m.g), "eta": m.eta}
@@ -473,7 +468,6 @@ class PairData:
     share: float
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The arrays for a file."""
         return {name: np.asarray(getattr(self, name)) for name in NAMES}
 
     @classmethod

@@ -104,7 +104,6 @@ class CameraSchedule(NamedTuple):
     every: int
 
     def numbers(self, k: int) -> list[int]:
-        """Numbers of the passes of chunk k."""
         return [] if k % self.every else [k // self.every * self.passes + j for j in range(self.passes)]
 
     @classmethod
@@ -329,8 +328,6 @@ def train_unattended(
 
 
 class _ObjectTraining:
-    """A training on its way."""
-
     def __init__(
         self,
         obj: TranslucentObject,
@@ -445,11 +442,9 @@ class _ObjectTraining:
             write_atomically(self.work / PLAN, to_json({"chunks": chunks}))
 
     def _marks(self) -> set[int | float]:
-        """Chunks after which the error is measured."""
         return {round(self.total * (k + 1) / VALIDATIONS) for k in range(VALIDATIONS - 1)}
 
     def _data(self, k: int) -> tuple[Pairs, Pairs]:
-        """Walks and proposals of chunk k."""
         if self.seen:
             return self.seen.data(k, PROPOSED * self.recipe.chunk)
         walks = self.source.walks(self.walks, (self.seed, k))

@@ -102,7 +102,6 @@ class _Pairs(NamedTuple):
     deep: np.ndarray
 
     def some(self, kept: np.ndarray | slice) -> _Pairs:
-        """The pairs that are kept."""
         return _Pairs(*(value[kept] for value in self))
 
 
@@ -207,7 +206,6 @@ def _reach_deep(pairs: _Pairs, alone: mi.Scene, holder: Geometry) -> np.ndarray:
 
 
 def _whole(pairs: _Pairs, alone: mi.Scene, holder: Geometry) -> np.ndarray:
-    """Whether all of the shape lies inside the object."""
     one, none = np.eye(4)[None], np.zeros(1, dtype=int)
     (a, b), (c, d) = ends_of(corners(alone.bbox(), one)), ends_of(corners(holder.scene.bbox(), one))
     _, points = _points_in(alone, _Pairs(none, none, one, one, a, b, np.zeros(1)))

@@ -62,7 +62,6 @@ def _class(variant: str) -> type:
             return mi.Point2f(*(_fraction(dr.brev(v)) for v in digits))
 
         def _next(self) -> mi.UInt32:
-            """The key of a number."""
             self._key = self._key + STEP
             return hashed(self._key)
 

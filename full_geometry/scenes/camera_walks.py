@@ -112,6 +112,5 @@ class CameraWalks:
             self.progress(self.found)
 
     def save(self) -> None:
-        """Write the image as it stands."""
         if self.found is not None:
             save(self.path, self.found)

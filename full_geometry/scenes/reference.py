@@ -176,7 +176,6 @@ class Limits:
 def _pass(
     reference: Reference | None, scene: mi.Scene, integrator: mi.Integrator, about: dict[str, Any], spp: int
 ) -> Reference:
-    """One more pass."""
     number, sensor = reference.passes if reference else 0, about["sensor"]
     started = time.perf_counter()
     seed = int(np.random.SeedSequence([about["seed"], number]).generate_state(1)[0])

@@ -197,7 +197,6 @@ class Picture:
         return as_png(self.image if image is None else image)
 
     def exr(self, image: np.ndarray) -> bytes:
-        """An image as it is."""
         return as_exr(image)
 
 

@@ -171,7 +171,6 @@ class DifferentiableTransport(TransportAround):
         return self.transport.prepare(at, active), at
 
     def S(self, exit: tuple[Any, SurfacePoint], at: SurfacePoint, active: mi.Bool = True) -> mi.Spectrum:
-        """See `Transport`."""
         prepared, out = exit
         with dr.suspend_grad():
             S = self.transport.S(prepared, at, active)

@@ -245,7 +245,6 @@ class Reflection:
         return self.boundary.eval(self._context(ctx), seen, _turned(wo, sign), active)
 
     def pdf(self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        """Density of `sample`."""
         seen, sign = _from_outside(si)
         return self.boundary.pdf(self._context(ctx), seen, _turned(wo, sign), active)
 
@@ -415,7 +414,6 @@ class HalfSpaceAlbedo:
 
 
 def _boundaries(props: mi.Properties) -> list[tuple[str, mi.BSDF]]:
-    """Names and surfaces of what stands inside."""
     return [(key, each) for key, each in props.objects() if isinstance(each, mi.BSDF)]
 
 
@@ -455,7 +453,6 @@ class MediumSpec:
 
     @property
     def is_homogeneous(self) -> bool:
-        """Whether the medium is the same everywhere."""
         return self.varying is None and self.textured is None
 
     @property
@@ -466,7 +463,6 @@ class MediumSpec:
         return VARIABLE if self.textured is None else tuple(n for n in VARIABLE if n in self.textured.constants)
 
     def channels(self) -> list[Medium]:
-        """The scalar media of the channels."""
         n = self.medium.n_channels
         return [self.medium] if n is None else [self.medium.channel(k) for k in range(n)]
 

@@ -57,7 +57,6 @@ class VaryingMedium:
         return sigma_t, self.albedo[:, None] * np.array(eval_volume(self.albedo_volume, p)) * sigma_t
 
     def albedo_at(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Spectrum:
-        """The albedo of single scattering at points."""
         return mi.Spectrum(self.albedo.tolist()) * eval_volume(self.albedo_volume, p, active)
 
 
@@ -188,7 +187,6 @@ def warn_of_means(spec: Any, obj: Geometry) -> None:
 
 
 def _points(box: mi.ScalarBoundingBox3f) -> mi.Point3f:
-    """Random points of a box."""
     u = np.random.default_rng(5).random((3, POINTS))
     low, high = (np.array(v, dtype=float)[:, None] for v in (box.min, box.max))
     return mi.Point3f(low + u * (high - low))

@@ -24,6 +24,7 @@ import mitsuba as mi
 
 from full_geometry.geometry.points import EntrySample, opaque, turned
 from full_geometry.geometry.shape import Geometry, name_of
+from full_geometry.geometry.snapshot import held
 from full_geometry.surface.translucent import is_translucent
 
 BENDS = {"NormalMap": "normalmap", "BumpMap": "bumpmap"}
@@ -45,7 +46,6 @@ class Mix(NamedTuple):
     other: mi.BSDF
 
     def share(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
-        """The share of the translucent surface."""
         weight = dr.clip(self.weight.eval_1(si, active), 0, 1)
         return weight if self.second else 1 - weight
 
@@ -167,7 +167,7 @@ def wrapping_of(shape: mi.Shape) -> Wrapping | None:
     while not is_translucent(bsdf):
         if not _holds_one(bsdf):
             return None
-        kind, parts = bsdf.class_name(), children(bsdf)
+        kind, parts = bsdf.class_name(), dict(held(bsdf))
         if kind not in WRAPPERS:
             raise ValueError(
                 "a translucent surface must stand alone or in twosided, normalmap, bumpmap, mask or blendbsdf, got "
@@ -203,18 +203,6 @@ def wrapping_of(shape: mi.Shape) -> Wrapping | None:
         mixes.append(Mix(parts["weight"], own[1], other))
         bsdf = both[own[1]]
     return Wrapping(bsdf, bend, tuple(mixes))
-
-
-def children(node: mi.Object) -> dict[str, object]:
-    """The objects and parameters that an object of Mitsuba holds, by name."""
-    found: dict[str, object] = {}
-
-    class Listing(mi.TraversalCallback):
-        def put(self, name: str, value: object, *flags: object) -> None:
-            found[name] = value
-
-    node.traverse(Listing())
-    return found
 
 
 def _holds_one(bsdf: mi.BSDF | None) -> bool:

@@ -227,7 +227,6 @@ class SceneSamples:
         return Assessment(tuple(objects), self.seconds, compiled, self.effort.seed)
 
     def training(self, k: int, technique: Technique) -> float:
-        """`training_seconds` of an object."""
         key = k, technique.model
         if key not in self._training:
             self._training[key] = training_seconds(self.on.scene, self.on.names[k], technique.model)
@@ -246,7 +245,6 @@ def _unseen(name: str, mfp: tuple[float, float]) -> ObjectTrade:
 
 
 def _mfp(on: Stage, k: int) -> tuple[float, float]:
-    """Mean free paths across an object."""
     box = on.shapes[k].bbox()
     size = float(np.linalg.norm(np.array(box.max, dtype=float) - np.array(box.min, dtype=float))) * on.mm_per_unit
     thickness = [size * float(m.sigma_t) for m in surface_of(on.shapes[k]).spec.channels()]

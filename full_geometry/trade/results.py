@@ -136,12 +136,10 @@ class ObjectTrade:
 
     @property
     def traced(self) -> TechniqueTrade:
-        """The row of walks."""
         return self.way(PATH_TRACED)
 
     @property
     def is_dark(self) -> bool:
-        """Whether no light comes from it."""
         return not any(value > 0 for value in self.radiance)
 
 
@@ -194,8 +192,6 @@ def plain(value: object) -> object:
 
 
 def html_table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table of plain text."""
-
     def row(cells: Sequence[str], kind: str) -> str:
         return "<tr>" + "".join(f"<{kind}>{escape(str(cell))}</{kind}>" for cell in cells) + "</tr>"
 

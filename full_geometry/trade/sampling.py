@@ -202,7 +202,6 @@ class TimedLaunch(NamedTuple):
 def _launch(
     stage: Stage, technique: Technique, exits: Exits, estimate: RadianceEstimate, each: int, seed: int
 ) -> TimedLaunch:
-    """`each` samples of every exit."""
     rays = exits.rays(each)
     dr.flush_malloc_cache()
     dr.detail.malloc_clear_statistics()
@@ -219,7 +218,6 @@ def _launch(
 
 
 def _sampler(seed: int, rays: mi.Ray3f) -> mi.Sampler:
-    """Independent numbers for each ray."""
     result = mi.load_dict({"type": "independent"})
     result.seed(seed, dr.width(rays))
     return result

@@ -57,7 +57,6 @@ class RadianceEstimate:
             self.bright[c] = tuple(np.concatenate(p) for p in zip(self.bright[c], (row[index], index // each)))
 
     def of_first(self, n: int) -> RadianceEstimate:
-        """The estimate of the first n exits."""
         result = RadianceEstimate(len(self.first), n)
         result.add(self.first[:, :n], self.second[:, :n], self.samples)
         result.bright = [(values[exits < n], exits[exits < n]) for values, exits in self.bright]
@@ -69,7 +68,6 @@ class RadianceEstimate:
 
     @property
     def sample_variance(self) -> np.ndarray:
-        """The variance of one sample."""
         n = self.samples
         return np.maximum(self.second / n - self.mean**2, 0) * (n / (n - 1))
 

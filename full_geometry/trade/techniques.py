@@ -20,21 +20,18 @@ from full_geometry.scenes.scene_files import PATH_TRACED, load_objects
 from full_geometry.settings import AUTO, check_variant
 from full_geometry.transport.models import model_names
 from halfspace_sss.checks import check_choice, check_count, check_interval
-from halfspace_sss.registry import model_class, models
 
 LAMBERT = "lambert"
-NO_SINGLE = "without single scattering"
 GATHERED, PRECOMPUTED = "gathered", "precomputed"
 RAYS = 2**19  # of light precomputed for walks, for each object: its noise at a point is 3 to 8 %
 
 
 @dataclass(frozen=True)
 class Technique:
-    """A model for all objects, or "path_traced"; with orders instead of those of the scene, if any.
+    """A model for all objects, or "path_traced", of the orders of the scene.
 
     Args:
         model: name of a model, or "path_traced": walks.
-        orders: "multiple" leaves single scattering out; None takes the orders of the scene.
         light: "sampled"; of models "gathered", see `Settings`; of walks "precomputed", see `unscattered_light`.
         part: of gathered light, see `Gathering`, 0 for all of it; of precomputed light one independent of other parts.
         blur: of walks, see `translucent_walk`.
@@ -42,7 +39,6 @@ class Technique:
     """
 
     model: str
-    orders: str | None = None
     light: str = "sampled"
     part: int = 0
     blur: float = 1.0
@@ -50,7 +46,6 @@ class Technique:
 
     @property
     def walks(self) -> bool:
-        """Whether the integrator is `translucent_walk`."""
         return self.model == PATH_TRACED
 
     @property
@@ -65,26 +60,22 @@ class Technique:
 
     @property
     def name(self) -> str:
-        """The name in tables."""
-        parts = (self.model, NO_SINGLE if self.orders else "", "" if self.light == "sampled" else self.light)
-        return ", ".join(filter(None, parts))
+        return self.model if self.light == "sampled" else f"{self.model}, {self.light}"
 
     @property
     def flags(self) -> str:
         """The options of the command `render` for it."""
-        asked = f"--model {self.model}" + (f" --orders {self.orders}" if self.orders else "")
-        return asked + (f" --light {self.light}" if self.walks or self.light != "sampled" else "")
+        return f"--model {self.model}" + (f" --light {self.light}" if self.walks or self.light != "sampled" else "")
 
     @classmethod
     def of(cls, name: str) -> Technique:
         """The technique of that name; ValueError if there is none."""
-        model, *more = name.split(", ")
+        model, _, light = name.partition(", ")
         check_choice("way", model, (PATH_TRACED, *(m for m in model_names() if m != AUTO)))
-        of_model = (NO_SINGLE,) if model == LAMBERT else (NO_SINGLE, GATHERED)
-        for part in more:
-            check_choice(f"light of {model}", part, (PRECOMPUTED,) if model == PATH_TRACED else of_model)
-        light = next((part for part in more if part != NO_SINGLE), "sampled")
-        return cls(model, "multiple" if NO_SINGLE in more else None, light)
+        known = {PATH_TRACED: (PRECOMPUTED,), LAMBERT: ()}.get(model, (GATHERED,))
+        if light:
+            check_choice(f"light of {model}", light, known)
+        return cls(model, light or "sampled")
 
 
 WALKS = Technique(PATH_TRACED)
@@ -92,13 +83,11 @@ PRECOMPUTED_WALKS = Technique(PATH_TRACED, light=PRECOMPUTED)
 
 
 def techniques() -> list[Technique]:
-    """All of them: path traced first, with light sampled and precomputed, a diffuse surface, every model with light
-    sampled and gathered, and those without the single scattering."""
+    """All of them: path traced first, with light sampled and precomputed, a diffuse surface, and every model with light
+    sampled and gathered."""
     names = [name for name in model_names() if name not in (AUTO, LAMBERT)]
     results = [WALKS, PRECOMPUTED_WALKS, Technique(LAMBERT), *map(Technique, names)]
-    results += [Technique(name, light=GATHERED) for name in names]
-    bare = [name for name in models() if model_class(name).orders == "multiple"]
-    return results + [Technique(name, "multiple") for name in bare if name in ("better_dipole", "neural")]
+    return results + [Technique(name, light=GATHERED) for name in names]
 
 
 @dataclass(eq=False)
@@ -168,7 +157,6 @@ class Stage:
             else:
                 plugin = {"type": "bssrdf", **self.settings, **self.bssrdf}
                 plugin |= {"model": technique.model, "light": technique.light}
-                plugin |= {"orders": technique.orders} if technique.orders else {}
             self._integrators[technique] = mi.load_dict(plugin)
             if technique.part and not technique.walks:
                 self._integrators[technique].gathering = Gathering(technique.part)

@@ -210,7 +210,6 @@ class NeuralShape(Transport):
         return self.half_space.models
 
     def end(self, at: SurfacePoint, active: mi.Bool = True) -> End:
-        """What belongs to one end alone."""
         return end(self.object, at, active)
 
     def prepare(self, at: SurfacePoint, active: mi.Bool = True) -> End:
@@ -228,7 +227,6 @@ class NeuralShape(Transport):
         return self(exit, self.end(at, active), active)
 
     def __call__(self, exit: End, entry: End, active: mi.Bool = True) -> mi.Spectrum:
-        """S of two ends, as `S`."""
         S_0 = self.half_space(exit, entry)
         pairs = describe(self.object, exit, entry, self.half_space.shares(S_0, exit, entry), active)
         f = mi.Spectrum([self._f(pair, numbers) for pair, numbers in zip(pairs, self._media)])
@@ -307,7 +305,6 @@ class HeldLight:
 
     @classmethod
     def of(cls, model: NeuralShape) -> HeldLight:
-        """Of a calibrated model."""
         obj = model.object
         starts = obj.random_points(generator(mi, SCORED, pass_seed(SEED, 4)))
         throughput, score = trace_scores(obj, starts, (SEED, 5))
@@ -359,7 +356,6 @@ def _relative_error(samples: np.ndarray) -> np.ndarray:
 
 
 def _walks(obj: TranslucentObject, n: int, k: int) -> np.ndarray:
-    """Throughputs of n walks."""
     starts = obj.random_points(generator(mi, n, pass_seed(SEED, 0, k)))
     return _rows(trace_exits(obj, starts, (SEED, 1, k)).T)
 

@@ -124,14 +124,12 @@ class Segment(NamedTuple):
 
     @classmethod
     def between(cls, a: mi.Point3f, b: mi.Point3f) -> Segment:
-        """From a to b."""
         way = b - a
         length = dr.norm(way)
         return cls(way / dr.maximum(length, LEAST_R), length)
 
     @property
     def back(self) -> Segment:
-        """From the other end."""
         return Segment(-self.d, self.length)
 
 

@@ -36,7 +36,7 @@ from full_geometry.transport.features import (
     pair_features,
     side_features,
 )
-from full_geometry.transport.patches import AREA_SHARE, ExitTable, LearntProposals, PatchSampler
+from full_geometry.transport.patches import AREA_SHARE, LearntProposals, PatchSampler, WeightTable
 from full_geometry.walk.media import media_within
 from full_geometry.walk.random_walk import WalkExits, exits
 from full_geometry.walk.scores import Score, scored_exits
@@ -161,7 +161,7 @@ class EntryProposals:
         self.positions = PositionSampler(replace(obj.geometry, pieces=None), table, obj.points, area_share)
 
     def sample(
-        self, exit: SurfacePoint, rng: mi.PCG32, table: ExitTable | None = None, k: mi.UInt32 | int = 0
+        self, exit: SurfacePoint, rng: mi.PCG32, table: WeightTable | None = None, k: mi.UInt32 | int = 0
     ) -> tuple[SurfacePoint, mi.Float]:
         """An entry for each exit, and mu_i over its density; 0 where none was found.
 

@@ -118,7 +118,6 @@ def _varying_channels(obj: TranslucentObject) -> tuple[int, int]:
 
 
 def n_local(obj: TranslucentObject) -> int:
-    """Number of what `local` gives."""
     if obj.textured is not None:
         return len(obj.media) * (2 - len({"albedo", "sigma_t"}.intersection(obj.textured.constants)))
     return 2 * sum(_varying_channels(obj))
@@ -345,7 +344,6 @@ class ObjectFrame:
         return self.direction(p - self.centre) / self.radius
 
     def direction(self, w: mi.Vector3f) -> mi.Vector3f:
-        """In the frame."""
         return mi.Vector3f(w) if self.turn is None else mi.Vector3f(*(dr.dot(row, w) for row in self.turn))
 
     def back(self, q: mi.Vector3f, d: mi.Vector3f) -> tuple[mi.Point3f, mi.Vector3f]:
@@ -378,7 +376,6 @@ class Terms(NamedTuple):
 
     @classmethod
     def of(cls, n: int) -> Terms:
-        """For n features of a side."""
         octaves = np.r_[3:POSITION, POSITION + 3 : 2 * POSITION]
         heads = np.concatenate([[0], 1 + np.setdiff1d(np.arange(n), octaves)])
         rows, cols = np.triu_indices(len(heads) - 1)
@@ -408,7 +405,6 @@ class Quadratic:
         self._square = Perceptron([square], [np.zeros(len(square), np.float32)], looped=True)
 
     def __call__(self, columns: list[mi.Float]) -> list[mi.Float]:
-        """Of the features of a side."""
         heads = [columns[k - 1] for k in self.heads]
         y = self._square(heads)
         rows = (y[k : k + len(heads)] for k in range(0, len(y), len(heads)))

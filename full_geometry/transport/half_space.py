@@ -94,7 +94,6 @@ class HalfSpaceProposals(Proposals):
     textured: TexturedMedium | None = None
 
     def lit(self, brightness: np.ndarray) -> HalfSpaceProposals:
-        """With more points where faces are bright."""
         return replace(self, positions=replace(self.positions, points=self.positions.points.lit(brightness)))
 
     def sample(

@@ -71,7 +71,6 @@ class HalfSpace:
         return floors
 
     def end(self, at: SurfacePoint, active: mi.Bool = True) -> Side:
-        """What belongs to one end alone."""
         return Side(at, first_event(self.object, at, active))
 
     def __call__(self, exit: Side, entry: Side, active: mi.Bool = True) -> mi.Spectrum:
@@ -156,7 +155,6 @@ class DirectionalAlbedo:
 
     @property
     def known(self) -> tuple[mi.Spectrum, mi.Spectrum]:
-        """See `geometry.points.ObjectAlbedo`."""
         return tuple(mi.Spectrum([opaque(float(v)) for v in row]) for row in self.trusted)
 
     def __call__(self, at: SurfacePoint, active: mi.Bool = True) -> tuple[mi.Spectrum, mi.Spectrum]:

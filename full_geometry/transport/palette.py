@@ -288,7 +288,6 @@ class Palette:
         return row.first, row.cells, row.low, 1 / row.step if row.step > 0 else 0.0, g, bend(g)
 
     def _tables(self) -> list[mi.Float]:
-        """`_numbers` by channel."""
         tables = [mi.Float([float(v) for v in column]) for column in zip(*map(self._numbers, range(len(self.rows))))]
         dr.make_opaque(tables)
         return tables

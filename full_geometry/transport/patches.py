@@ -118,11 +118,9 @@ class Patches:
         dr.eval(self.tables)
 
     def row(self, key: str, k: mi.UInt32) -> mi.Float | mi.UInt32:
-        """An entry of a table."""
         return dr.gather(type(self.tables[key]), self.tables[key], k)
 
     def point(self, patch: mi.UInt32, u_face: mi.Float, u: mi.Point2f) -> Point:
-        """A uniform point of a patch."""
         low, high = self.row("start", patch), self.row("start", patch + 1)
         goal = u_face * self.row("area", patch)
 
@@ -225,21 +223,23 @@ class _CumulativeRow:
         return dr.gather(type(self.table), self.table, self.start + k)
 
 
-class ExitTable:
-    """Weights of given exits, looked up by their number.
+class WeightTable:
+    """Weights of exits or cells, looked up by their number.
 
     Args:
-        sampler: whose network is asked, once for each.
-        exits: points of the surface.
+        weights: of all patches, (exits, patches).
     """
 
-    def __init__(self, sampler: PatchSampler, exits: SurfacePoint) -> None:
-        side = Side(exits, first_event(sampler.patches.object, exits))
-        rows = np.cumsum(_weights(sampler, side, dr.width(exits.p)), axis=1).astype(np.float32)
+    def __init__(self, weights: np.ndarray) -> None:
+        rows = np.cumsum(weights, axis=1).astype(np.float32)
         self.n, self.table, self.last = rows.shape[1], mi.Float(rows.ravel()), mi.Float(rows[:, -1].copy())
 
+    @classmethod
+    def of(cls, sampler: PatchSampler, exits: SurfacePoint) -> WeightTable:
+        """Ask the network of a sampler once for each of given exits."""
+        return cls(_weights(sampler, Side(exits, first_event(sampler.patches.object, exits)), dr.width(exits.p)))
+
     def weights(self, k: mi.UInt32) -> PatchWeights:
-        """Of exit k."""
         return PatchWeights(_CumulativeRow(self.table, k * self.n), dr.gather(type(self.last), self.last, k))
 
 
@@ -270,23 +270,17 @@ class PatchTable:
             exit = surface_point(at.p, normal, n_out, cosine_direction(n_out, normal, rng))
             exit = obj.knowing(exit, mi.UInt32(at.prim_index))
             total = total + _weights(sampler, Side(exit, first_event(obj, exit)), n)
-        rows = np.cumsum(total / EXITS, axis=1).astype(np.float32)
-        self.n, self.table, self.of_face = sampler.patches.n, mi.Float(rows.ravel()), faces
-        self.last = mi.Float(rows[:, -1].copy())
-        dr.eval(self.table, self.of_face, self.last)
+        self.cells, self.of_face = WeightTable(total / EXITS), faces
+        dr.eval(self.cells.table, self.of_face, self.cells.last)
 
     def lit(self, brightness: np.ndarray) -> PatchTable:
-        """With weights times the brightness of patches."""
         result = copy(self)
-        rows = np.array(self.table).reshape(-1, self.n)
-        rows = np.cumsum(np.diff(rows, axis=1, prepend=0) * brightness, axis=1).astype(np.float32)
-        result.table, result.last = mi.Float(rows.ravel()), mi.Float(rows[:, -1].copy())
+        rows = np.array(self.cells.table).reshape(-1, self.cells.n)
+        result.cells = WeightTable(np.diff(rows, axis=1, prepend=0) * brightness)
         return result
 
     def weights(self, face: mi.UInt32) -> PatchWeights:
-        """Of an exit on a face."""
-        cell = dr.gather(type(self.of_face), self.of_face, face)
-        return PatchWeights(_CumulativeRow(self.table, cell * self.n), dr.gather(type(self.last), self.last, cell))
+        return self.cells.weights(dr.gather(type(self.of_face), self.of_face, face))
 
 
 def _weights(sampler: PatchSampler, exit: Side, n: int) -> np.ndarray:
@@ -339,7 +333,6 @@ class LearntProposals(CosineProposals):
     table: PatchTable | None = None
 
     def lit(self, brightness: np.ndarray) -> LearntProposals:
-        """With weights times the brightness of faces."""
         table, parts = self.table, self.patches.patches
         if table is not None:
             areas = self.positions.points.areas

@@ -80,7 +80,7 @@ def test_weights_of_patches_have_the_same_bits_however_many_threads_the_blas_has
     tables = []
     for threads in (1, 2, 3):
         with threadpool_limits(threads, "blas"):
-            tables.append(np.array(PatchTable(sampler).table))
+            tables.append(np.array(PatchTable(sampler).cells.table))
     assert all(np.array_equal(table, tables[0]) for table in tables)
 
 
