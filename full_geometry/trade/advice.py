@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from full_geometry.scenes.scene_files import PATH_TRACED
-from full_geometry.trade.assessing import assess, once
+from full_geometry.trade.assessing import assess
 from full_geometry.trade.results import UNNAMED, Assessment, ObjectTrade, TechniqueTrade, html_table, samples_for
 from full_geometry.trade.techniques import GATHERED, LAMBERT, PRECOMPUTED_WALKS, Job, Technique
 from halfspace_sss.noise_free import short
@@ -98,7 +98,6 @@ def recommend(
     tolerance: float = 0.05,
     images: int = 1,
     seconds: float | None = None,
-    count_training: bool = True,
     seed: int = 0,
     **assessing: Any,
 ) -> Advice:
@@ -111,14 +110,13 @@ def recommend(
         tolerance: relative error of radiance over the visible points of an object, bias and noise together.
         images: how many are to be rendered; preparation and training count once.
         seconds: that the whole job may take; if no way keeps the tolerance then, that with the least error is named.
-        count_training: whether the time of a training that has been done counts too.
         seed: of the assessment.
         assessing: what else `assess` takes; its `seconds` is called `assess_seconds` here.
 
     Raises:
         ValueError: an argument is out of range, or the scene cannot be rendered.
     """
-    job = Job(tolerance, images, seconds, count_training)
+    job = Job(tolerance, images, seconds)
     if isinstance(scene, Assessment):
         return advise(scene, job)
     if "assess_seconds" in assessing:
@@ -176,7 +174,7 @@ def _option(assessed: ObjectTrade, row: TechniqueTrade, job: Job) -> _Raw:
     if not needed < math.inf:
         return math.inf, 0.0, row.bias, row
     spp = max(math.ceil(needed), 1)
-    took = once(row, job) + job.images * assessed.pixels * spp * row.seconds
+    took = row.once + job.images * assessed.pixels * spp * row.seconds
     return took, spp, math.hypot(row.bias, math.sqrt(row.variance / spp)), row
 
 
@@ -184,7 +182,7 @@ def _in_time(assessed: ObjectTrade, row: TechniqueTrade, job: Job) -> _Raw:
     """Samples and error of a technique in the time that is allowed; its bias where there is no limit."""
     if job.seconds is None:
         return math.inf, 0, row.bias, row
-    left = job.seconds - once(row, job)
+    left = job.seconds - row.once
     spp = math.floor(left / (job.images * assessed.pixels * row.seconds)) if left > 0 else 0
     error = math.hypot(row.bias, math.sqrt(row.variance / spp)) if spp > 0 else math.inf
     return float(job.seconds), spp, error, row
@@ -197,13 +195,13 @@ def _told(assessed: ObjectTrade, option: _Raw, best: _Raw, job: Job) -> Option:
         size = f"{assessed.mfp[0]:.3g} to {assessed.mfp[1]:.3g} mean free paths across"
         images = "an image" if job.images == 1 else f"{job.images} images"
         why = f"{row.way} is the cheapest that keeps {job.tolerance:.3g} ({size}): {off}, {images} in {_time(took)}"
-        why += f" with {int(spp)} samples a pixel" + _training(row, job)
+        why += f" with {int(spp)} samples a pixel" + _training(row)
         why += f"; render {Technique.of(row.way).flags} --spp {int(spp)}"
     elif took < math.inf:
         over = job.seconds is not None and took > job.seconds
         why = f"{row.way} takes {_time(took)}"
         why += f", allowed {_time(job.seconds)}" if over else f", {short(took / best[0])} times as long" + f" ({off})"
-        why += _training(row, job)
+        why += _training(row)
     elif row.bias2 - 2 * row.bias2_error < job.tolerance**2:
         why = f"{row.way} is {off}: whether it keeps {job.tolerance:.3g} cannot be measured with so few samples"
     else:
@@ -225,10 +223,10 @@ def _nearest(option: _Raw, best: _Raw, job: Job) -> Option:
     return Option(row.way, took, int(spp), error, why)
 
 
-def _training(row: TechniqueTrade, job: Job) -> str:
+def _training(row: TechniqueTrade) -> str:
     if not row.training:
         return ""
-    return f", its training of {_time(row.training)} {'counted' if job.count_training else 'left out'}"
+    return f", its training of {_time(row.training)} counted"
 
 
 def _off(row: TechniqueTrade) -> str:

@@ -156,7 +156,7 @@ def _assessed_for(
     else:
         # Leave out what trains for longer than walks need for the job, with the points that its noise allows.
         first = samples.assessment()
-        out |= too_dear(samples, first, chosen, job) if job.count_training else {}
+        out |= too_dear(samples, first, chosen, job)
         ahead, later = ([t for t in some if t not in out] for some in (ahead, later))
         samples.keep(first)
         # Run one model of the half-space; where it is far off the others are left out, as they err alike.
@@ -327,7 +327,7 @@ def left_out(assessed: ObjectTrade, technique: Technique, job: Job, seconds: flo
     if row.bias2 - DOUBT * row.bias2_error > job.tolerance**2:
         off = f"{technique.model} is {row.told_bias} % off"
         return f"not measured, as {off}, asked {100 * job.tolerance:.3g} %"
-    least = once(row, job) + GATHERING * row.seconds
+    least = row.once + GATHERING * row.seconds
     if least > best:
         return f"not measured, as another way keeps {job.tolerance:.3g} in {best:.2g} s, before its light is gathered"
     parts = row.preparation + 2 * PART * GATHERING * row.seconds
@@ -348,7 +348,7 @@ def most_promising(seen: Sequence[ObjectTrade], wanted: Sequence[Technique], job
         for o in seen:
             row = o.way(technique.model)
             chance = NormalDist().cdf((job.tolerance**2 - max(row.bias2, 0.0)) / max(row.bias2_error, 1e-30))
-            total += chance * (once(row, job) + GATHERING * row.seconds) + (1 - chance) * cheapest(o, job)
+            total += chance * (row.once + GATHERING * row.seconds) + (1 - chance) * cheapest(o, job)
         return total
 
     return min(wanted, key=expected)
@@ -357,13 +357,8 @@ def most_promising(seen: Sequence[ObjectTrade], wanted: Sequence[Technique], job
 def cheapest(assessed: ObjectTrade, job: Job) -> float:
     """Seconds of a job by the techniques that have been measured."""
     rows, n = [row for row in assessed.ways if not row.refusal and row.variance >= 0], job.images * assessed.pixels
-    jobs = [samples_for(row, job.tolerance) * row.seconds * n + once(row, job) for row in rows]
+    jobs = [samples_for(row, job.tolerance) * row.seconds * n + row.once for row in rows]
     return min(jobs, default=math.inf)
-
-
-def once(row: TechniqueTrade, job: Job) -> float:
-    """Seconds before the first image."""
-    return row.preparation + (row.training if job.count_training else 0.0)
 
 
 def contenders(assessed: ObjectTrade, tolerance: float) -> list[str]:

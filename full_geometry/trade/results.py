@@ -88,6 +88,11 @@ class TechniqueTrade:
         """A bound that the bias is below in 95 % of cases; a square that came out below 0 counts as 0."""
         return self.off.bound
 
+    @property
+    def once(self) -> float:
+        """Seconds before the first image."""
+        return self.preparation + self.training
+
     def time_to(self, noise: float) -> float:
         """Seconds for each pixel of the object until its noise is so much of the mean radiance."""
         return self.variance / noise**2 * self.seconds

@@ -219,13 +219,11 @@ class Job:
         tolerance: relative error of radiance, bias and noise together.
         images: of the object, each as large as the film.
         seconds: that all of them may take; None for no limit.
-        count_training: whether the time of a training that has been done counts too.
     """
 
     tolerance: float = 0.05
     images: int = 1
     seconds: float | None = None
-    count_training: bool = True
 
     def __post_init__(self) -> None:
         check_interval("tolerance", self.tolerance, 1e-4, 10.0)

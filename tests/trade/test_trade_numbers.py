@@ -185,7 +185,6 @@ def test_a_training_counts_once() -> None:
     found = _assessment(GOOD, trained)
     assert recommend(found, tolerance=0.05).objects[0].way == "neural"
     assert recommend(found, tolerance=0.05, images=10_000).objects[0].way == "full_geometry"
-    assert recommend(found, tolerance=0.05, count_training=False).objects[0].way == "full_geometry"
 
 
 def test_a_limit_of_time_names_the_least_error_where_nothing_keeps_the_tolerance() -> None:
