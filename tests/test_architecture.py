@@ -35,7 +35,7 @@ ENTRY_POINTS = {"halfspace_sss.models"}  # by which packages above join the plan
 HIDING = {"bssrdf", "curves", "models", "trace"}  # public functions: a folder of that name would hide one
 LONGEST_BODY = 60
 ADDRESS = re.compile(r"[a-z_]\w*(?:\.\w+)+(?::\w+)?")  # "package.module" or "package.module:name"
-MOST_ANY = 33  # parameters in `full_geometry` whose type is left open
+MOST_ANY = 40  # parameters in `full_geometry` whose type is left open
 
 
 @functools.cache

@@ -11,7 +11,7 @@ import re
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import mitsuba as mi
 
@@ -65,7 +65,7 @@ def plainly(function: Callable) -> Callable:
     """
 
     @functools.wraps(function)
-    def found(*args: Any, **more: Any) -> Any:
+    def found(*args: object, **more: object) -> object:
         try:
             return function(*args, **more)
         except RuntimeError as error:
@@ -278,7 +278,7 @@ def _shares_surface(state: ParserState) -> bool:
     return len(set(found)) < len(found)
 
 
-def _references(props: Any) -> list[int]:
+def _references(props: mi.Properties) -> list[int]:
     """Numbers of the nodes that a node refers to."""
     values = [props[key] for key in props.keys()]
     return [value.index() for value in values if isinstance(value, mi.Properties.ResolvedReference)]
@@ -299,7 +299,7 @@ def apart(function: Callable, parse: Callable) -> Callable:
     """
 
     @functools.wraps(function)
-    def found(scene: Any, *args: Any, **more: Any) -> Any:
+    def found(scene: dict | str, *args: object, **more: object) -> mi.Scene | mi.Object:
         if not args and "optimize" not in more and _asks_apart(parse, scene, more):
             more["optimize"] = False
         return function(scene, *args, **more)
@@ -307,7 +307,7 @@ def apart(function: Callable, parse: Callable) -> Callable:
     return found
 
 
-def _asks_apart(parse: Callable, scene: Any, more: Mapping[str, Any]) -> bool:
+def _asks_apart(parse: Callable, scene: dict | str, more: Mapping[str, object]) -> bool:
     """Whether meshes of a scene have to stay apart; what cannot be read is left to who loads it."""
     if isinstance(scene, dict) and scene.get("type") != "scene":
         return False
