@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
 AUTOMATIC = -1.0
+MM_PER_UNIT = (1e-9, 1e9)
 ORDERS = ("total", "multiple", "single")
 GEOMETRIES = ("distance", "tangent")
 LIGHTS = ("sampled", "gathered", "auto")
@@ -57,7 +58,7 @@ class Settings:
     orders: str = ""
 
     def __post_init__(self) -> None:
-        check_interval("mm_per_unit", self.mm_per_unit, 1e-9, 1e9)
+        check_interval("mm_per_unit", self.mm_per_unit, *MM_PER_UNIT)
         check_interval("tolerance", self.tolerance, 1e-4, 10.0)
         check_interval("choice_share", self.choice_share, 0.0, 1.0)
         if self.max_depth < -1 or self.max_depth == 0:

@@ -49,7 +49,7 @@ from full_geometry.geometry.shape import (
 )
 from full_geometry.geometry.snapshot import Snapshot
 from full_geometry.objects.inclusions import Inclusion, find_inclusions, place_of
-from full_geometry.settings import Capabilities, check_variant
+from full_geometry.settings import MM_PER_UNIT, Capabilities, check_variant
 from full_geometry.surface.medium_derivatives import MediumDerivatives
 from full_geometry.surface.spectral import MediumByWavelength
 from full_geometry.surface.textured import TexturedMedium
@@ -57,6 +57,7 @@ from full_geometry.surface.translucent import MediumSpec, check_boundary
 from full_geometry.surface.varying import VaryingMedium, equivalent
 from full_geometry.surface.wrapped import Wrapping, surface_of, wrapping_of
 from halfspace_sss import measure
+from halfspace_sss.checks import check_interval
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.registry import bssrdf
@@ -484,8 +485,7 @@ def object_of(
 
 def _in_scene_units(medium: Medium | None, mm_per_unit: float) -> tuple[Medium, ...]:
     """The scalar medium of each channel, 1/(scene unit)."""
-    if not (math.isfinite(mm_per_unit) and mm_per_unit > 0):
-        raise ValueError(f"mm_per_unit must be finite and > 0, got {mm_per_unit!r}")
+    check_interval("mm_per_unit", mm_per_unit, *MM_PER_UNIT)
     if not isinstance(medium, Medium):
         raise ValueError(f"medium must be a Medium, got {type(medium).__name__}")
     n = len(mi.Spectrum(0))

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.scenes.reference_store import Reference, load, save
+from full_geometry.scenes.reference_store import Reference, finite_pixels, load, save
 
 if TYPE_CHECKING:
     from full_geometry.integrators.walk_paths import FirstExits
@@ -89,7 +89,7 @@ class CameraWalks:
                 keep=lambda each: kept.append(each.of_object(k)),
             )  # fmt: skip
         if number != TRIAL:
-            self._add(name, number, np.array(image, dtype=np.float32), spp, time.perf_counter() - started)
+            self._add(name, number, finite_pixels("walks from the camera", image), spp, time.perf_counter() - started)
         return kept
 
     @staticmethod
@@ -99,11 +99,7 @@ class CameraWalks:
         return k
 
     def _add(self, name: str, number: int, image: np.ndarray, spp: int, seconds: float) -> None:
-        image = image[..., None] if image.ndim == 2 else image
-        if not np.isfinite(image).all():
-            bad = int((~np.isfinite(image)).any(axis=2).sum())
-            raise ValueError(f"walks from the camera must be finite, got {bad} pixels that are not")
-        result = self.found or Reference(np.zeros(image.shape), np.zeros(image.shape), 0, 0, 0.0, self.about)
+        result = self.found or Reference.empty(image.shape, self.about)
         passes = result.about.get(PASSES, {})
         if number >= passes.get(name, 0):
             result = result.add(image, spp, seconds)

@@ -5,14 +5,16 @@ Mitsuba's volume path tracers, which nobody here wrote, then render the same lig
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.scenes.scene_files import parsed, references
+from full_geometry.settings import MM_PER_UNIT
 from full_geometry.surface.translucent import MediumSpec, is_smooth_boundary
 from full_geometry.surface.varying import VaryingMedium
+from halfspace_sss.checks import check_interval
 
 FAR = 1e5  # scene units within which objects lie
 VOLUME_PATH = {"type": "volpathmis", "max_depth": -1, "rr_depth": 64}
@@ -37,13 +39,9 @@ def with_media(scene: dict | str | Path, mm_per_unit: float, integrator: dict | 
         ValueError: mm_per_unit is out of range, or an object has something that Mitsuba's media have not: other
             orders than "total", a boundary without reflection, or a mean cosine that differs between channels.
     """
-    if not (math.isfinite(mm_per_unit) and mm_per_unit > 0):
-        raise ValueError(f"mm_per_unit must be finite and > 0, got {mm_per_unit!r}")
-    config = mi.parser.ParserConfig(mi.variant())
-    config.parallel = False  # objects then have the same numbers each time, and kernels are found in Dr.Jit's cache
+    check_interval("mm_per_unit", mm_per_unit, *MM_PER_UNIT)
+    state, config = parsed(scene, {})
     config.merge_meshes = False  # merged ones would lose the medium
-    is_dict = isinstance(scene, dict)
-    state = mi.parser.parse_dict(config, scene) if is_dict else mi.parser.parse_file(config, str(scene))
     mi.parser.transform_all(config, state)
     for node in list(state.nodes):
         if node.type == mi.ObjectType.Shape:
@@ -52,17 +50,11 @@ def with_media(scene: dict | str | Path, mm_per_unit: float, integrator: dict | 
     return mi.parser.instantiate(config, state)
 
 
-def _references(props: mi.Properties) -> list[tuple[str, int]]:
-    """Names and node numbers of what a node refers to."""
-    values = [(key, props[key]) for key in props.keys()]
-    return [(key, value.index()) for key, value in values if isinstance(value, mi.Properties.ResolvedReference)]
-
-
 def _fill(
     config: mi.parser.ParserConfig, state: mi.parser.ParserState, shape: mi.Properties, mm_per_unit: float
 ) -> None:
     """Replace the translucent surface of a shape by its boundary and an interior medium."""
-    for key, index in _references(shape):
+    for key, index in references(shape).items():
         if state.nodes[index].props.plugin_name() != "translucent":
             continue
         surface = _instance(config, state, index)
@@ -85,15 +77,11 @@ def _instance(config: mi.parser.ParserConfig, state: mi.parser.ParserState, inde
 
 def _replace_integrator(state: mi.parser.ParserState, integrator: dict) -> None:
     root = state.nodes[0].props
-    names = [key for key, index in _references(root) if state.nodes[index].type == mi.ObjectType.Integrator]
-    unknown = [key for key, index in _references(root) if state.nodes[index].props.plugin_name() in _OURS]
-    for name in (*names, *unknown):
-        if name in root:
-            del root[name]
+    for key, index in references(root).items():
+        node = state.nodes[index]
+        if node.type == mi.ObjectType.Integrator or node.props.plugin_name() in ("bssrdf", "translucent_walk"):
+            del root[key]
     root["integrator"] = mi.load_dict(integrator)
-
-
-_OURS = ("bssrdf", "translucent_walk")
 
 
 def medium(spec: MediumSpec, mm_per_unit: float) -> mi.Medium:

@@ -23,7 +23,7 @@ import numpy as np
 from full_geometry.geometry.snapshot import children, scene_hash, words
 from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.objects.objects import translucent_shapes
-from full_geometry.scenes.reference_store import BY_CHANCE, CHANNELS, Reference, load, save
+from full_geometry.scenes.reference_store import BY_CHANCE, CHANNELS, Reference, finite_pixels, load, save
 from full_geometry.scenes.scene_files import first_cause
 from full_geometry.settings import AUTO, check_variant
 from full_geometry.surface.wrapped import surface_of
@@ -180,14 +180,10 @@ def _pass(
     started = time.perf_counter()
     seed = int(np.random.SeedSequence([about["seed"], number]).generate_state(1)[0])
     image = mi.render(scene, sensor=sensor, integrator=integrator, seed=seed, spp=spp)
-    image = np.array(image, dtype=np.float32)
-    image = image[..., None] if image.ndim == 2 else image
-    if not np.isfinite(image).all():
-        bad = int((~np.isfinite(image)).any(axis=2).sum())
-        raise ValueError(f"pass {number} must be finite, got {bad} pixels that are not")
+    image = finite_pixels(f"pass {number}", image)
     if reference is None and (names := channel_names(scene.sensors()[sensor].film(), integrator, image.shape[2])):
         about = {**about, CHANNELS: names}
-    start = reference or Reference(np.zeros(image.shape), np.zeros(image.shape), 0, 0, 0.0, about)
+    start = reference or Reference.empty(image.shape, about)
     result = start.add(image, spp, time.perf_counter() - started)
     if not is_bssrdf(integrator) or mi.is_spectral:
         return result

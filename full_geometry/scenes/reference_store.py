@@ -46,6 +46,11 @@ class Reference:
     seconds: float
     about: dict[str, Any] = field(default_factory=dict)
 
+    @classmethod
+    def empty(cls, shape: tuple[int, ...], about: dict[str, Any]) -> Reference:
+        """Before the first pass."""
+        return cls(np.zeros(shape), np.zeros(shape), 0, 0, 0.0, about)
+
     @property
     def standard_error(self) -> np.ndarray:
         """The standard error of the mean, per pixel and channel; infinite after fewer than two passes."""
@@ -89,6 +94,16 @@ class Reference:
         variance = squares / (n * (passes - 1)) if passes > 1 else np.zeros_like(mean)
         mean, variance = sum(_halves(mean)), sum(_halves(variance))
         return replace(self, mean=mean, variance=variance, passes=passes, spp=n, seconds=self.seconds + seconds)
+
+
+def finite_pixels(name: str, image: mi.TensorXf) -> np.ndarray:
+    """An image that was rendered, (height, width, channels) in float32; ValueError if a value of it is not finite."""
+    pixels = np.array(image, dtype=np.float32)
+    pixels = pixels[..., None] if pixels.ndim == 2 else pixels
+    if not np.isfinite(pixels).all():
+        bad = int((~np.isfinite(pixels)).any(axis=2).sum())
+        raise ValueError(f"{name} must be finite, got {bad} pixels that are not")
+    return pixels
 
 
 def _halves(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

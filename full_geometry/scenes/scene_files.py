@@ -5,7 +5,6 @@ What Mitsuba raises is brought down to its first cause: errors of plugins come w
 
 from __future__ import annotations
 
-import difflib
 import functools
 import re
 import warnings
@@ -19,6 +18,7 @@ from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.settings import LIGHTS, ORDERS, PATH_TRACED, SHARED, WALK_LIGHTS, check_variant
 from full_geometry.surface.wrapped import surface_of
 from full_geometry.transport.models import model_names, of_objects
+from halfspace_sss.checks import check_choice
 from halfspace_sss.interrupts import is_interrupt
 
 if TYPE_CHECKING:
@@ -150,13 +150,14 @@ def open_scene(
 
     With `floats`, texels of bitmaps are floats, which can be changed by any amount, whatever their files have.
     """
-    _check("model", model, (*model_names(), PATH_TRACED))
-    _check("orders", orders, ORDERS)
     light = (settings or {}).get("light")
     walks = model == PATH_TRACED
     known = WALK_LIGHTS if walks else LIGHTS if model else tuple(dict.fromkeys((*LIGHTS, *WALK_LIGHTS)))
-    _check("light", light, known)
-    state, config = _parsed(scene, parameters or {})
+    asked = ("model", model, (*model_names(), PATH_TRACED)), ("orders", orders, ORDERS), ("light", light, known)
+    for name, value, choices in asked:
+        if value is not None:
+            check_choice(name, value, choices)
+    state, config = parsed(scene, parameters or {})
     names = [str(props.get("model", "")) for props in _surfaces(state)]
     _transform(scene, state, config, apart=walks or _apart(state, model))
     for props in _surfaces(state):  # anew: the nodes have moved
@@ -199,17 +200,10 @@ def load_objects(scene: dict | str | Path, parameters: Mapping[str, str] | None 
         ValueError: no such file or parameter, the file is no scene, a plugin refuses what it is given, or there is no
             translucent object.
     """
-    state, config = _parsed(scene, parameters or {})
+    state, config = parsed(scene, parameters or {})
     _surfaces(state)
     _transform(scene, state, config, apart=True)
     return _made(scene, state, config)
-
-
-def _check(name: str, value: str | None, known: tuple[str, ...]) -> None:
-    if value is not None and value not in known:
-        close = difflib.get_close_matches(value, known, n=1)
-        hint = f"; did you mean {close[0]!r}?" if close else ""
-        raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}{hint}")
 
 
 def _surfaces(state: ParserState) -> list[mi.Properties]:
@@ -234,7 +228,8 @@ def _made(scene: dict | str | Path, state: ParserState, config: ParserConfig) ->
         mi.set_file_resolver(before)
 
 
-def _parsed(scene: dict | str | Path, parameters: Mapping[str, str]) -> tuple[ParserState, ParserConfig]:
+def parsed(scene: dict | str | Path, parameters: Mapping[str, str]) -> tuple[ParserState, ParserConfig]:
+    """What a scene says, and how Mitsuba is to make it; ValueError if it cannot be read."""
     check_variant()
     config = mi.parser.ParserConfig(mi.variant())
     config.parallel = False  # objects then have the same numbers each time, and kernels are found in Dr.Jit's cache
@@ -274,20 +269,20 @@ def _shares_surface(state: ParserState) -> bool:
     found = []
     for node in state.nodes:
         if node.type == mi.ObjectType.Shape and node.props.plugin_name() not in NO_MESHES:
-            found += [index for index in _references(node.props) if _is_translucent(state, index)]
+            found += [index for index in references(node.props).values() if _is_translucent(state, index)]
     return len(set(found)) < len(found)
 
 
-def _references(props: mi.Properties) -> list[int]:
-    """Numbers of the nodes that a node refers to."""
-    values = [props[key] for key in props.keys()]
-    return [value.index() for value in values if isinstance(value, mi.Properties.ResolvedReference)]
+def references(props: mi.Properties) -> dict[str, int]:
+    """Numbers of the nodes that a node refers to, by name."""
+    values = {key: props[key] for key in props.keys()}
+    return {key: value.index() for key, value in values.items() if isinstance(value, mi.Properties.ResolvedReference)}
 
 
 def _is_translucent(state: ParserState, index: int) -> bool:
     """Whether a node is a translucent surface, or something around one."""
     props = state.nodes[index].props
-    return props.plugin_name() == "translucent" or any(_is_translucent(state, k) for k in _references(props))
+    return props.plugin_name() == "translucent" or any(_is_translucent(state, k) for k in references(props).values())
 
 
 def apart(function: Callable, parse: Callable) -> Callable:

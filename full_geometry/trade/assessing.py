@@ -14,6 +14,7 @@ import mitsuba as mi
 
 from full_geometry.integrators.gathering import PART
 from full_geometry.learning.learners import Learner, learner
+from full_geometry.scenes.reference import check_sensor
 from full_geometry.scenes.scene_files import PATH_TRACED, first_cause
 from full_geometry.trade.images import with_flip
 from full_geometry.trade.measuring import OWN_SHARE, RunBudget, SceneSamples
@@ -90,8 +91,7 @@ def assess(
     check_interval("train_seconds", train_seconds, 0.0, 1e7)
     chosen = _chosen(models if models is not None or job is None else CANDIDATES)
     on = stage(scene, parameters)
-    if how.sensor >= len(on.scene.sensors()):
-        raise ValueError(f"sensor must be below {len(on.scene.sensors())}, the number of sensors, got {how.sensor}")
+    check_sensor(on.scene, how.sensor)
     if train_seconds > 0:
         learn(on, train_seconds, how.seed, progress)
     if job is None:

@@ -16,6 +16,7 @@ from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.integrators.gathering import Gathering
 from full_geometry.objects.objects import KnowsUnit, millimetres, refuse_instances, translucent_shapes
 from full_geometry.objects.small_emitters import is_delta
+from full_geometry.scenes.reference import check_sensor
 from full_geometry.scenes.scene_files import PATH_TRACED, load_objects
 from full_geometry.settings import AUTO, check_variant
 from full_geometry.transport.models import model_names
@@ -186,8 +187,7 @@ def stage(scene: mi.Scene | dict[str, Any] | str | Path, parameters: dict[str, s
     shapes = translucent_shapes(loaded)
     if not shapes:
         raise ValueError("the scene must have an object with a translucent BSDF, got none")
-    if not loaded.sensors():
-        raise ValueError("the scene must have a sensor, got none")
+    check_sensor(loaded, 0)
     refuse_instances(loaded, shapes, "the trade")
     return Stage(loaded, shapes, *_settings(loaded))
 
