@@ -1,4 +1,4 @@
-"""Snapshots of objects of Mitsuba and their parameters, by which a later edit is seen.
+"""Snapshots of objects of Mitsuba, by which a later edit is seen, and digests, by which a scene is known again.
 
 Values count, by checksums of their bytes. The numbers that Dr.Jit gives to its variables tell nothing: they are given
 again once a variable is freed. Neither would values that are kept: NumPy's views of them write into them.

@@ -1,4 +1,4 @@
-"""Signed distances put together from primitives, and closed triangle meshes of their zero level."""
+"""Signed distances put together from primitives, closed meshes of their zero level, and random shapes of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Learning the network of all shapes, by the likelihood of exits and the light of groups of them."""
+"""Learning the network of all shapes, by the likelihood of exits and the light of groups, and the data for it."""
 
 from __future__ import annotations
 
@@ -352,10 +352,6 @@ class _ShapeTraining:
         }  # fmt: skip
         arrays = {name: value.astype(np.float16) for name, value in self.fitting.arrays().items()}
         return save_weights(Path(folder) / WEIGHTS, KIND, arrays, record)
-
-
-# --------------------------------------------------------------------------------------------------
-# Training data of the network of all shapes: random objects, pairs of their points, groups of their exits.
 
 
 # ---- Which shapes and media the network is trained on: drawn at random, each from its own seed -----

@@ -1,4 +1,5 @@
-"""The file of a long render: mean and variance of the mean as channels of one EXR, what it is of in its header.
+"""The file of a long render: mean and variance of the mean as channels of one EXR, what it is of in its header; its
+picture.
 
 Each quantity q is two float32 channels, q and q.rest, whose sum holds 48 bits: the state after a pass is rounded to
 that, so that a run that is read back goes on with the same numbers as one that was never interrupted.

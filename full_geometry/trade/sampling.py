@@ -1,4 +1,4 @@
-"""One way of rendering, against the clock: radiance of exits from random samples, with what they cost."""
+"""One way of rendering, against the clock: radiance of exits from random samples, what they cost, where exits are."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The techniques by which a scene can be rendered, and the same loaded scene rendered by one after the other."""
+"""The techniques by which a scene can be rendered one after the other, for which job, and by which light."""
 
 from __future__ import annotations
 

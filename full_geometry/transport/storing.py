@@ -1,4 +1,4 @@
-"""Weights of objects on disk, found again by the object they belong to.
+"""Weights of objects on disk, found again by the object they belong to, and their binding to it.
 
 It is the same shape of the same size in mean free paths, wherever it stands.
 """
