@@ -26,7 +26,7 @@ FLOORS = {  # of each package, a room or file may import those to its left; "" i
         "neural.training", "cli",
     ],
     "full_geometry": [
-        "", "geometry", "surface", "objects", "walk", "sampling", "transport", "precomputed", "integrators", "scenes",
+        "", "geometry", "surface", "objects", "walk", "transport", "precomputed", "integrators", "scenes",
         "learning", "inverse", "trade", "plugins", "cli",
     ],
     "figures": ["parts", "modelling", "computing", "drawing", "beyond", ""],

@@ -17,6 +17,7 @@ from full_geometry.geometry import mesh
 from full_geometry.geometry.instances import InstanceScene
 from full_geometry.geometry.sensors import (
     past_emitters,
+    path_numbers,
     rays_by,
     sampled_size,
     seeded_sampler,
@@ -28,7 +29,6 @@ from full_geometry.integrators.lit_entries import LitEntries
 from full_geometry.integrators.surface_paths import replay_paths, trace_paths
 from full_geometry.objects.objects import KnowsUnit, TranslucentObject
 from full_geometry.objects.small_emitters import check_emitters
-from full_geometry.sampling.low_discrepancy import path_numbers
 from full_geometry.settings import Choices, Settings, read_settings
 from full_geometry.surface.translucent import is_translucent
 from full_geometry.surface.wrapped import wraps
@@ -233,7 +233,7 @@ class Launch(NamedTuple):
     spp: int
 
     def sampler(self, sensor: mi.Sensor, seed: int) -> mi.Sampler:
-        """Its random numbers: of `low_discrepancy` in place of independent ones, else of the sampler of a sensor."""
+        """Its random numbers: of `path_numbers` in place of independent ones, else of the sampler of a sensor."""
         if is_independent(sensor.sampler()):
             return path_numbers(seed, int(dr.prod(sampled_size(sensor.film()))), *self)
         return seeded_sampler(sensor, self.spp, seed)
@@ -247,7 +247,7 @@ def is_independent(sampler: mi.Sampler) -> bool:
 def launches(sensor: mi.Sensor, spp: int) -> Iterator[Launch]:
     """Launches of about equally many samples, each to be rendered to the film of a sensor.
 
-    Only samples of the sampler `independent` are split, as those of `low_discrepancy` go on in the next launch. Other
+    Only samples of the sampler `independent` are split, as those of `path_numbers` go on in the next launch. Other
     samplers round the samples of each launch up to a square or another number of strata: they have one launch.
     """
     spp = spp or sensor.sampler().sample_count()

@@ -21,6 +21,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.geometry.light_points import GOLDEN, SurfacePoints
 from full_geometry.geometry.points import cosine_above, opaque, place
 from full_geometry.geometry.rounding import blocked, ray_from
 from full_geometry.geometry.snapshot import Snapshot, same_objects
@@ -39,7 +40,6 @@ from full_geometry.precomputed.transport_matrix import (
     cosine,
     transport_matrix,
 )
-from full_geometry.sampling.light_points import GOLDEN, SurfacePoints
 from full_geometry.walk.emission import emitter_pdf, mis_weight, sample_emitter
 from halfspace_sss.backend import clock
 

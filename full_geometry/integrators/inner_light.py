@@ -22,8 +22,8 @@ from full_geometry.precomputed.inner import Events, InnerLight, bands
 from full_geometry.precomputed.transport_matrix import R_2
 
 if TYPE_CHECKING:
+    from full_geometry.geometry.light_points import SurfacePoints
     from full_geometry.objects.objects import TranslucentObject
-    from full_geometry.sampling.light_points import SurfacePoints
     from full_geometry.settings import Settings
 
 COUNT = 2**17  # events

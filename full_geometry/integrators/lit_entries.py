@@ -19,13 +19,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.geometry.light_points import SurfacePoints, uniform_entries
 from full_geometry.geometry.points import AreaPoints
 from full_geometry.geometry.shape import Geometry
 from full_geometry.geometry.snapshot import Snapshot, same_objects
 from full_geometry.integrators.gathering import GatheringPoint, by_emitters, light_state, met_by_cosine, spreads
 from full_geometry.integrators.lighting import Primal, RenderContext
 from full_geometry.precomputed.transport_matrix import Albedo
-from full_geometry.sampling.light_points import SurfacePoints, uniform_entries
 
 if TYPE_CHECKING:
     from full_geometry.geometry.points import Proposals

@@ -17,8 +17,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.geometry.light_points import GOLDEN, REACH, SurfacePoints, lattice, uniform_entries
 from full_geometry.geometry.points import EntrySample, PositionSampler, evaluate, opaque
-from full_geometry.sampling.light_points import GOLDEN, REACH, SurfacePoints, lattice, uniform_entries
 
 PLACES = 2**17
 ROOTS = 2**0.5, 3**0.5, 5**0.5  # of their lattice: by that of the points they would be in step with all of these

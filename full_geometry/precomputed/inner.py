@@ -21,9 +21,9 @@ import mitsuba as mi
 import numpy as np
 from scipy.sparse import csc_array, csr_array
 
+from full_geometry.geometry.light_points import lattice, uniform_entries
 from full_geometry.geometry.points import cosine_above, opaque, place, refract_in, surface_point
 from full_geometry.geometry.rounding import ray_from
-from full_geometry.sampling.light_points import lattice, uniform_entries
 
 if TYPE_CHECKING:
     from full_geometry.objects.objects import TranslucentObject

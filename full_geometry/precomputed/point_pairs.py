@@ -13,8 +13,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.geometry.light_points import GOLDEN
 from full_geometry.geometry.points import EntrySample, SurfacePoint
-from full_geometry.sampling.light_points import GOLDEN
 
 if TYPE_CHECKING:
     from full_geometry.objects.objects import TranslucentObject

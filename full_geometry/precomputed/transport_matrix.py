@@ -47,10 +47,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.geometry.light_points import GOLDEN, REACH, SurfacePoints
 from full_geometry.geometry.points import EntrySample, SurfacePoint, cosine_above, evaluate, opaque, wrapped
 from full_geometry.precomputed.entries import PLACES, StratifiedEntries
 from full_geometry.precomputed.point_pairs import EntryPairs, Rays, lit_pairs
-from full_geometry.sampling.light_points import GOLDEN, REACH, SurfacePoints
 from halfspace_sss.physics.fresnel import F_t
 
 if TYPE_CHECKING:

@@ -36,11 +36,11 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.geometry.instances import InstanceTransform, corners, ends_of
+from full_geometry.geometry.light_points import lattice, uniform_entries
 from full_geometry.geometry.points import EntrySample, cosine_above, cosine_density, lift, opaque, sided
 from full_geometry.geometry.rounding import blocked, ray_from
 from full_geometry.precomputed.forward_scattering import kept_forward, quadratic_part, split_extinction, truncated
 from full_geometry.precomputed.inside_cells import POINTS, InsideCells, grid_edge
-from full_geometry.sampling.light_points import lattice, uniform_entries
 from full_geometry.walk.media import WalkMedia
 from full_geometry.walk.random_walk import Event, fly, free_path, pick, sample_bsdf, turn
 from halfspace_sss.tracing.walk import generator, pass_seed

@@ -1,4 +1,4 @@
-"""How wrong and how dear techniques of rendering a scene are, by its own lights, camera and objects; which are tried."""
+"""How wrong and how dear techniques of rendering a scene are, by its lights, camera and objects; which are tried."""
 
 from __future__ import annotations
 

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from full_geometry.geometry.light_points import SurfacePoints, uniform_entries
 from full_geometry.geometry.shape import analyse_shape
 from full_geometry.integrators.gathering import _steadied, _stratified
 from full_geometry.learning.meshes import Box, box, surface
 from full_geometry.precomputed.entries import StratifiedEntries
 from full_geometry.precomputed.point_pairs import Rays, lit_pairs
 from full_geometry.precomputed.transport_matrix import Incident, RowUniforms
-from full_geometry.sampling.light_points import SurfacePoints, uniform_entries
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -13,7 +13,7 @@ PIXELS, SPP, BINS = 4096, 16, 8
 
 def numbers(seed: int, first: int = 0, spp: int = SPP) -> np.ndarray:
     """A single number, a pair and another single number, (4, pixels, samples)."""
-    from full_geometry.sampling.low_discrepancy import path_numbers
+    from full_geometry.geometry.sensors import path_numbers
 
     mi.set_variant("llvm_ad_rgb")
     sampler = path_numbers(seed, PIXELS, first, spp)

@@ -1,1 +1,0 @@
-"""Points on surfaces and low-discrepancy numbers."""
