@@ -50,8 +50,8 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """The fast tests keep their kernels apart: they are compiled without LLVM's optional passes."""
-    if config.option.markexpr == "not slow":
+    """Whole suites keep their kernels apart: they are compiled without LLVM's optional passes."""
+    if config.option.markexpr in ("not slow", "slow"):
         QUICKLY.mkdir(parents=True, exist_ok=True)
         os.environ.setdefault("DRJIT_CACHE_DIR", str(QUICKLY))
 
@@ -60,10 +60,13 @@ def pytest_collection_finish() -> None:
     """Halve what a kernel takes to be compiled, and look through no modules where garbage is collected.
 
     LLVM skips its optional passes. Results are the same; walks take up to 30 % longer, which is less than that saves.
+    Processes that tests start compile as those of users do.
     """
     path = os.environ.get("DRJIT_LIBLLVM_PATH")
     if path and "drjit" in sys.modules and os.environ.get("DRJIT_CACHE_DIR") == str(QUICKLY):
-        options = (ctypes.c_char_p * 3)(b"tests", b"-opt-bisect-limit=0", b"-opt-bisect-verbose=false")
+        options = (ctypes.c_char_p * 4)(
+            b"tests", b"-opt-bisect-limit=0", b"-opt-bisect-verbose=false", b"-regalloc=basic"
+        )
         ctypes.CDLL(path).LLVMParseCommandLineOptions(len(options), options, None)
     gc.freeze()
 
