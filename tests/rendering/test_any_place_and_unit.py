@@ -100,14 +100,16 @@ def test_a_scene_is_the_same_in_metres(thing: tuple, integrator: dict[str, Any])
     assert abs(apart.mean()) < 4.5 * apart.std() / np.sqrt(apart.size / 3) + 1e-5 * known.mean()  # some paths part
 
 
-def _means(frame: Frame, thing: tuple, integrator: dict[str, Any]) -> list[float]:
-    return [_image(frame, *thing, integrator, spp=256, seed=k).mean() for k in range(12)]
+def _images(frame: Frame, thing: tuple, integrator: dict[str, Any]) -> np.ndarray:
+    """By two seeds; the scene is loaded, and what lies inside objects found, once."""
+    scene = mi.load_dict(_scene(frame, *thing, integrator))
+    return np.array([np.array(mi.render(scene, spp=64, seed=k), dtype=float) for k in range(2)])
 
 
 @cache
-def _unmoved(thing: tuple, integrator: tuple) -> list[float]:
+def _unmoved(thing: tuple, integrator: tuple) -> np.ndarray:
     """What every frame is held against."""
-    return _means(Frame(), thing, dict(integrator))
+    return _images(Frame(), thing, dict(integrator))
 
 
 @pytest.mark.slow
@@ -115,10 +117,12 @@ def _unmoved(thing: tuple, integrator: tuple) -> list[float]:
 @by_walk_and_model
 @each_thing
 def test_a_scene_is_the_same_anywhere(thing: tuple, integrator: dict[str, Any], frame: Frame) -> None:
-    parts = [_unmoved(thing, tuple(integrator.items())), _means(frame, thing, integrator)]
-    known, other = np.mean(parts, axis=1)
-    error = np.sqrt(np.var(parts, axis=1, ddof=1).sum() / 12)
-    assert abs(other - known) < 5 * error + 1e-4 * known  # Student's t with about 20 degrees of freedom
+    """Paths of one seed part where rounding does alone: their difference has a tenth of their own error."""
+    known = _unmoved(thing, tuple(integrator.items()))
+    apart = (_images(frame, thing, integrator) - known) / known.mean()
+    error = apart.std() / np.sqrt(apart.size / 3)  # as if all channels of a path parted together
+    assert error < 3e-3  # reached by the thin leaf, where the float32 of its place is coarsest
+    assert abs(apart.mean()) < 4.5 * error + 1e-4
 
 
 @pytest.mark.parametrize("kind", ["cube", "sphere", "cylinder", "disk", "rectangle", "bsplinecurve", "sdfgrid"])
