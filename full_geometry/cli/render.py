@@ -157,7 +157,7 @@ def _off(scene: mi.Scene, image: np.ndarray, sensor: int, model: str | None) -> 
     try:
         return told(mean_ratios(scene, image, sensor), model or "the model of the scene")
     except (ValueError, RuntimeError) as error:
-        return [f"how far models are off is not known, as random walks refuse the scene: {first_cause(error)}"]
+        return [f"the error of models is unknown, as random walks refuse the scene: {first_cause(error)}"]
 
 
 def _opened(scene: Path, transport: TransportOptions, parameters: dict[str, str], denoise: bool) -> mi.Scene:

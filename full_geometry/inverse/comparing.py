@@ -142,8 +142,8 @@ class ChiSquare(NamedTuple):
             return []
         return [
             f"noise does not explain the residuals ({(self.value - 1) / self.error:.0f} standard errors): lights, "
-            "cameras, exposures, shape, index or boundary of the scene are not those of the images, or steps are too "
-            "few; the errors do not hold that"
+            "cameras, exposures, shape, index or boundary of the scene differ from the images', or steps are too "
+            "few; the stated errors leave that out"
         ]
 
 

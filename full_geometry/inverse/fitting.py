@@ -324,8 +324,8 @@ class MediumDescent:
         if abs(step) <= CERTAIN * error:
             return []
         return [
-            f"all renders times {np.exp(step):.3g} ± {np.exp(step) * error:.1g}, with another medium, would come "
-            "closer: check exposures of the images and the power of the lights; the errors do not hold that"
+            f"all renders times {np.exp(step):.3g} ± {np.exp(step) * error:.1g}, with another medium, would fit "
+            "better: check exposures of the images and the power of the lights; the stated errors leave that out"
         ]
 
     def _render(self, which: int, k: int, purpose: str, sloped: bool) -> tuple[np.ndarray, np.ndarray | None]:
@@ -371,4 +371,6 @@ def _ambiguity(values: dict[str, np.ndarray], correlation: np.ndarray) -> list[s
         places[name], at = range(at, at + len(value)), at + len(value)
     found = [correlation[i, places["g"][0]] for i in places[extent]]
     told = " ".join(f"{c:.3f}" for c in found)
-    return [f"correlation of log {extent} and g: {told}; near 1 in size, images tell sigma_t (1 - g) only"]
+    return [
+        f"correlation of log {extent} and g: {told}; where its size is near 1, images determine sigma_t (1 - g) only"
+    ]

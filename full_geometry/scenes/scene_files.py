@@ -349,7 +349,7 @@ def _choose_integrator(
     else:
         warnings.warn(
             f"the integrator {others[0].plugin_name()!r} of the scene shows no light from inside translucent objects; "
-            "'bssrdf' and 'translucent_walk' do, which a model that is asked for brings along",
+            "name a model, and 'bssrdf' or 'translucent_walk' takes its place",
             stacklevel=3,
         )
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
 INTEGRATOR = "bssrdf"
-DARK = "no light comes from it, every way shows it black"
+DARK = "no light comes from it, every technique shows it black"
 
 
 @dataclass(frozen=True)
@@ -108,8 +108,8 @@ def recommend(
     Args:
         scene: as in `assess`, or an `Assessment` that has been made.
         tolerance: relative error of radiance over the visible points of an object, bias and noise together.
-        images: how many are to be rendered; preparation and training count once.
-        seconds: that the whole job may take; if no way keeps the tolerance then, that with the least error is named.
+        images: number of images; preparation and training count once.
+        seconds: longest time of the whole job; if no technique keeps the tolerance then, the least error is named.
         seed: of the assessment.
         assessing: what else `assess` takes; its `seconds` is called `assess_seconds` here.
 
@@ -205,7 +205,7 @@ def _told(assessed: ObjectTrade, option: _Raw, best: _Raw, job: Job) -> Option:
     elif row.bias2 - 2 * row.bias2_error < job.tolerance**2:
         why = f"{row.way} is {off}: whether it keeps {job.tolerance:.3g} cannot be measured with so few samples"
     else:
-        why = f"{row.way} is {off}, asked {100 * job.tolerance:.3g} %"
+        why = f"{row.way} is {off}, the tolerance is {100 * job.tolerance:.3g} %"
     return Option(row.way, took, int(spp), error, why)
 
 
@@ -213,7 +213,7 @@ def _nearest(option: _Raw, best: _Raw, job: Job) -> Option:
     took, spp, error, row = option
     within = f" in {_time(took)}" if took < math.inf else ""
     if option is best:
-        why = f"no way keeps {job.tolerance:.3g}{within}; {row.way} comes nearest, {100 * error:.3g} %"
+        why = f"no technique keeps {job.tolerance:.3g}{within}; {row.way} comes nearest, {100 * error:.3g} %"
     elif not within:
         why = f"{row.way} is {_off(row)}"
     elif spp > 0:

@@ -326,10 +326,10 @@ def left_out(assessed: ObjectTrade, technique: Technique, job: Job, seconds: flo
         return row.refusal
     if row.bias2 - DOUBT * row.bias2_error > job.tolerance**2:
         off = f"{technique.model} is {row.told_bias} % off"
-        return f"not measured, as {off}, asked {100 * job.tolerance:.3g} %"
+        return f"not measured, as {off}, the tolerance is {100 * job.tolerance:.3g} %"
     least = row.once + GATHERING * row.seconds
     if least > best:
-        return f"not measured, as another way keeps {job.tolerance:.3g} in {best:.2g} s, before its light is gathered"
+        return f"not measured, as another keeps {job.tolerance:.3g} in {best:.2g} s, before its light is gathered"
     parts = row.preparation + 2 * PART * GATHERING * row.seconds
     if parts > LONGEST * seconds:
         return f"not measured, as its light is gathered for {parts:.2g} s or longer: ask for it by its name"

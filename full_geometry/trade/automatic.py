@@ -178,12 +178,12 @@ def picked(assessed: ObjectTrade, tolerance: float, light: str = "sampled", mode
     rows = [row for row in assessed.ways if not row.refusal and row.way in techniques]
     if not rows or assessed.is_dark:
         name = _default([techniques[row.way] for row in rows] or list(techniques.values()))
-        why = f"object {assessed.object!r}: {name}, as nothing is seen that could be compared"
+        why = f"object {assessed.object!r}: {name}, as the camera sees nothing to compare"
         return Pick(name, 0.0 if rows else math.inf, why)
     keeping = [row for row in rows if row.bias_bound <= tolerance]
     if keeping:
         best = min(keeping, key=lambda row: _cost(assessed, row, tolerance))
-        why = f"{best.told_bias} % off, asked {100 * tolerance:.3g} %"
+        why = f"{best.told_bias} % off, the tolerance is {100 * tolerance:.3g} %"
     else:
         best = min(rows, key=lambda row: (row.bias_bound, _cost(assessed, row, tolerance)))
         why = f"the least wrong, {best.told_bias} % off"

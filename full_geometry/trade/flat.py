@@ -207,8 +207,8 @@ def _advice(rows: list[_Row], tolerance: float, r: tuple[float, float], unit: st
         elif row in keeping:
             why = f"{name} is {seconds / best.seconds:.2g} times dearer: {off}, {cost}"
         elif error.square - 2 * error.square_error > tolerance**2:
-            why = f"{name} is {off}, asked {100 * tolerance:.3g} %"
+            why = f"{name} is {off}, the tolerance is {100 * tolerance:.3g} %"
         else:
-            why = f"{name} is {off}: whether it keeps {100 * tolerance:.3g} % takes more events to tell"
+            why = f"{name} is {off}: whether it keeps {100 * tolerance:.3g} % is open, more events would tell"
         options.append(FlatOption(name, error.value, error.bound, 1e6 * seconds, why))
     return FlatAdvice(best.name, tolerance, r, tuple(options))

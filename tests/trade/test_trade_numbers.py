@@ -164,7 +164,9 @@ def test_a_bias_that_noise_hides_is_told_as_a_bound_and_never_as_0() -> None:
     assert lucky.told_bias == "< 1.3" and trade._row(row)[1] == "< 1.3" and trade._row(walks)[1] == "exact"
     why = {option.way: option.why for option in recommend(found, tolerance=0.011).objects[0].options}
     assert "< 1.3 % off" in why["standard_dipole"]
-    assert picked(found.objects[0], 0.05).sentence == ("object 'ball': standard_dipole, < 1.3 % off, asked 5 %")
+    assert picked(found.objects[0], 0.05).sentence == (
+        "object 'ball': standard_dipole, < 1.3 % off, the tolerance is 5 %"
+    )
 
 
 def test_every_way_gets_one_sentence() -> None:
@@ -173,7 +175,7 @@ def test_every_way_gets_one_sentence() -> None:
     found = recommend(_assessment(CHEAP, GOOD, doubtful, refused), tolerance=0.1).objects[0]
     why = {option.way: option.why for option in found.options}
     assert why["neural"].startswith("neural is the cheapest that keeps 0.1 (30 to 40 mean free paths across)")
-    assert why["lambert"] == "lambert is 20 ± 0.03 % off, asked 10 %"
+    assert why["lambert"] == "lambert is 20 ± 0.03 % off, the tolerance is 10 %"
     assert "cannot be measured" in why["better_dipole"]
     assert "times as long (exact)" in why["path_traced"]
     assert why["full_geometry"] == "full_geometry: it must be trained"
@@ -190,7 +192,7 @@ def test_a_training_counts_once() -> None:
 def test_a_limit_of_time_names_the_least_error_where_nothing_keeps_the_tolerance() -> None:
     found = recommend(_assessment(CHEAP, GOOD), tolerance=0.02, images=1000, seconds=0.2).objects[0]
     assert found.way == "lambert"
-    assert found.options[0].why.startswith("no way keeps 0.02 in 0.2 s; lambert comes nearest")
+    assert found.options[0].why.startswith("no technique keeps 0.02 in 0.2 s; lambert comes nearest")
 
 
 def test_a_dark_object_takes_the_fastest_way() -> None:
@@ -321,7 +323,7 @@ def test_bad_input_is_refused(given: dict, message: str) -> None:
     [
         (0.1, 10_000, 4.0, ""),
         (0.1, 1, 4.0, "before its light is gathered"),
-        (0.005, 10_000, 4.0, "asked 0.5 %"),
+        (0.005, 10_000, 4.0, "the tolerance is 0.5 %"),
         (0.1, 10_000, 0.15, "ask for it by its name"),
     ],
 )

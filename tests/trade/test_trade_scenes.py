@@ -129,7 +129,7 @@ def test_an_extreme_object_is_assessed(extreme: str) -> None:
 
 def test_without_light_every_way_shows_it_black() -> None:
     found = recommend(scene(light={"type": "constant", "radiance": 0.0}), models=FEW, **QUICK_ASSESS)
-    assert "no light comes from it, every way shows it black" in str(found)
+    assert "no light comes from it, every technique shows it black" in str(found)
 
 
 QUICK_ASSESS = {"assess_seconds": 0.4, "exits": 64}
@@ -421,7 +421,7 @@ def test_a_medium_without_a_scene_gets_a_model_of_the_half_space() -> None:
     found = recommend_flat(medium, r=(1.0, 40.0), tolerance=0.2, events=2e5, models=["better_dipole", "neural"])
     assert found.model == "neural"
     assert [option.model for option in found.options] == ["neural", "path_traced", "better_dipole"]
-    assert found.options[-1].why.endswith("asked 20 %")
+    assert found.options[-1].why.endswith("the tolerance is 20 %")
     neural, traced, _ = found.options
     for option in (neural, traced):
         assert f"{option.seconds_per_million:.3g} s for a million values" in option.why
