@@ -36,15 +36,15 @@ if TYPE_CHECKING:
 
 GROUPS: Mapping[str, tuple[str, Mapping[str, Callable]]] = {
     "materials": (
-        "Show the registered materials.",
+        "Show registered materials, or import them from files of other programs.",
         {"list": materials_list, "show": materials_show, "import": materials_import},
     ),
     "train": (
-        "Train networks on path tracing: models find them by the medium, and by the shape of an object.",
+        "Train networks on path tracing; models find their weights by medium and object.",
         {"material": train_material, "universal": train_universal, "object": train_object, "shapes": train_shapes},
     ),
     "errors": (
-        "Measure how wrong models are.",
+        "Measure errors of models against path tracing and published values.",
         {"materials": errors_materials, "object": errors_object, "truths": errors_truths},
     ),
     "figures": ("Compute changed parts of the paper's figures, and draw them.", FIGURES),
@@ -63,7 +63,9 @@ def _show_version(wanted: bool) -> None:
 
 def start(
     context: typer.Context,
-    version: Annotated[bool, typer.Option("--version", callback=_show_version, is_eager=True)] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version.")
+    ] = False,
 ) -> None:
     """Half-space subsurface scattering: compare path tracing and models of the BSSRDF."""
     context.obj = drawers()
@@ -96,7 +98,7 @@ def _draw_trade(picture: TradePicture) -> dict[str, bytes]:
 
 def make() -> typer.Typer:
     """All commands, those of other packages too."""
-    app = group("", cls=Commands, completion=True)
+    app = group("Compare, train, render and fit models of subsurface scattering.", cls=Commands, completion=True)
     app.callback()(start)
     for name, function in SINGLE.items():
         add(app, name, function)
