@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import figures
 from benchmarks.ablation_command import ablation_command
+from benchmarks.bench_command import bench
 from benchmarks.inversion_command import inversion_command
 from benchmarks.rivals_command import rivals_command
 from benchmarks.shapes_command import shapes_command
@@ -17,6 +18,7 @@ figures.ADDED |= {"equal_error": "benchmarks.equal_error", "trade": "benchmarks.
 figures.ADDED |= {name: f"benchmarks.published.{name}" for name in ("fig03", "fig07", "fig08", "table1")}
 COMMANDS = {
     "ablation": ablation_command,
+    "bench": bench,
     "gathered": gathered_command,
     "inversion": inversion_command,
     "rivals": rivals_command,

@@ -101,7 +101,7 @@ def _budgets(seconds: float | None, samples: int | None) -> Sequence[Budget]:
 
 
 def _write(out: Path, table: pandas.DataFrame, summary: pandas.DataFrame, caption: str, how: dict) -> list[Path]:
-    from halfspace_sss.comparison.bench import machine
+    from benchmarks.bench import machine
 
     content: JsonDict = {"provenance": provenance(**how), "machine": machine(), "caption": caption}
     content["summary"] = json.loads(summary.to_json(orient="records"))

@@ -20,6 +20,7 @@ import mitsuba as mi
 import numpy as np
 import torch
 
+from benchmarks.fits import Objective
 from benchmarks.flow import N_CONTEXT, Chart, ConditionalFlow, FlowSampler, context, direction_square
 from benchmarks.flow_training import FlowBatch, FlowNetwork, FlowRecipe, Walks, flow_walks, walk_batches
 from full_geometry.geometry.points import SurfacePoint, opaque
@@ -30,7 +31,7 @@ from full_geometry.transport.patches import Patches, PatchSampler, PatchWeights,
 from full_geometry.transport.storing import frame_of
 from halfspace_sss.arrays import Lanes
 from halfspace_sss.neural.perceptron import Perceptron
-from halfspace_sss.neural.training.fit import Objective, fit
+from halfspace_sss.neural.training.fit import fit
 
 CLEAR = 1e-4  # of the size of the object: where the ray that finds a face begins
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from benchmarks import equal_error_tables
+from benchmarks.bench import kernel_seconds
 from figures.computing.contenders import (
     MODELS,
     OF_OBJECTS,
@@ -40,7 +41,6 @@ from figures.modelling.objects import TISSUES, VARYING, tissue
 from figures.parts.part import Part, Result, Task, unmodelled
 from figures.parts.records import Params, SceneDict
 from halfspace_sss import materials
-from halfspace_sss.backend import kernel_seconds
 from halfspace_sss.checks import check_choice
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder

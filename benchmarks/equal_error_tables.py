@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from benchmarks.tables import in_markdown
 from figures.computing.contenders import VOLUMES, WALK, volume
-from figures.drawing.labels import in_markdown, label
+from figures.drawing.image_files import label
 from figures.parts.records import Params, Row
 from halfspace_sss.comparison.style import look
 

@@ -15,6 +15,7 @@ import torch
 import zuko
 from torch import nn
 
+from benchmarks.fits import CpuSchedule, Objective
 from benchmarks.flow import (
     BINS,
     LEAST_SLOPE,
@@ -34,7 +35,7 @@ from full_geometry.transport.patches import Patches
 from full_geometry.transport.storing import Learnt
 from halfspace_sss.arrays import Lanes
 from halfspace_sss.checks import check_count
-from halfspace_sss.neural.training.fit import CpuSchedule, Objective, Source, fit
+from halfspace_sss.neural.training.fit import Source, fit
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 # ---- Training of conditional flows by zuko: -E[T log p(x | context)] over walks --------------------

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import torch
 
+from benchmarks.fits import Objective
 from benchmarks.flow import Chart
 from benchmarks.flow_training import FlowBatch, FlowRecipe, Lighting, likelihood_weights, walks_of
 from full_geometry.geometry.points import EntrySample, cosine_above, opaque
@@ -19,7 +20,7 @@ from full_geometry.transport.features import n_side
 from full_geometry.transport.patches import PatchSampler
 from full_geometry.transport.storing import Learnt
 from halfspace_sss.arrays import Lanes
-from halfspace_sss.neural.training.fit import Objective, fit
+from halfspace_sss.neural.training.fit import fit
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 LIGHTINGS = ("sky", "direction", "near light")

@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from benchmarks.alpha_p import fit_alpha_p
+from benchmarks.bench import kernel_seconds
 from benchmarks.flow import FlowProposals, FlowSampler
 from benchmarks.flow_training import FlowRecipe, Lighting, fit_flow
 from benchmarks.lightings import LIGHTINGS, fit_patches, lighting
@@ -38,7 +39,6 @@ from full_geometry.transport.half_space import HalfSpaceProposals
 from full_geometry.transport.one_object import HalfSpace
 from full_geometry.transport.patches import AREA_SHARE, LearntProposals, PatchTable
 from full_geometry.transport.storing import KIND, Learnt
-from halfspace_sss.backend import kernel_seconds
 from halfspace_sss.checks import check_choice, check_count
 from halfspace_sss.neural.store import load_weights
 from halfspace_sss.tracing.walk import generator, pass_seed

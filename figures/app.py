@@ -19,7 +19,6 @@ from full_geometry.cli.render import render
 from full_geometry.cli.trade import trade
 from full_geometry.cli.train import errors_object, train_object, train_shapes
 from full_geometry.cli.variants import Drawers
-from halfspace_sss.cli.bench import bench
 from halfspace_sss.cli.curves import curves
 from halfspace_sss.cli.errors import errors_materials, errors_truths
 from halfspace_sss.cli.lists import materials_import, materials_list, materials_show, models
@@ -50,7 +49,7 @@ GROUPS: Mapping[str, tuple[str, Mapping[str, Callable]]] = {
     "figures": ("Compute changed parts of the paper's figures, and draw them.", FIGURES),
 }
 SINGLE = {
-    "bench": bench, "curves": curves, "fit": fit, "maps": maps, "models": models,
+    "curves": curves, "fit": fit, "maps": maps, "models": models,
     "render": render, "trade": trade, "validate": validate,
 }  # fmt: skip
 

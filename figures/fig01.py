@@ -22,8 +22,7 @@ from figures.computing.modelled import VIEWS, View, foot, scene
 from figures.computing.references import NOTE, against, reference_image, reference_shot
 from figures.computing.scenes import environment_file, prepare
 from figures.computing.timed import COMPILING
-from figures.drawing.image_files import image_files, rows_of
-from figures.drawing.labels import label
+from figures.drawing.image_files import image_files, label, rows_of
 from figures.modelling.objects import TISSUES, tissue
 from figures.parts.part import Part, Result, Task
 

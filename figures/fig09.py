@@ -12,8 +12,7 @@ from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training
 from figures.computing.references import NOTE, against, long_reference, reference_shot
 from figures.computing.scenes import BUNNY, MATERIALS, bunny_scene, prepare
 from figures.computing.timed import COMPILING, gathered_anew
-from figures.drawing.image_files import image_files
-from figures.drawing.labels import label
+from figures.drawing.image_files import image_files, label
 from figures.parts.part import Part, Result, Task
 from halfspace_sss import materials
 from halfspace_sss.backend import clock

@@ -12,8 +12,7 @@ from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training
 from figures.computing.references import NOTE, against, long_reference, reference_shot
 from figures.computing.scenes import BUNNY, prepare
 from figures.computing.timed import TimedRender, alternating, pass_size
-from figures.drawing.image_files import image_files
-from figures.drawing.labels import label
+from figures.drawing.image_files import image_files, label
 from figures.parts.part import Part, Result, Task
 from figures.parts.records import Row
 from halfspace_sss import materials

@@ -7,7 +7,6 @@ import os
 import sys
 import time
 import warnings
-from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
 from types import ModuleType
@@ -198,14 +197,3 @@ def array_types(backend: str = "llvm") -> ModuleType:
     if not dr.has_backend(getattr(dr.JitBackend, backend.upper())):
         raise BackendError(f"Dr.Jit's {backend} backend cannot run here")
     return getattr(dr, backend)
-
-
-def kernel_seconds(make: Callable[[], object]) -> float:
-    """Seconds in which the kernels run that compute what `make` returns, without tracing and compiling them."""
-    import drjit as dr
-
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.kernel_history_clear()
-        dr.eval(make())
-        dr.sync_thread()
-        return 1e-3 * sum(kernel["execution_time"] for kernel in dr.kernel_history([dr.KernelType.JIT]))

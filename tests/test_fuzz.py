@@ -33,7 +33,7 @@ COMPUTES = [  # what is replaced: the properties are of what comes before the co
     "halfspace_sss.comparison.model_errors.references", "halfspace_sss.neural.train",
     "halfspace_sss.neural.training.train_universal.train_universal",
     "halfspace_sss.comparison.truths.validate",
-    "halfspace_sss.cli.bench._measured", "full_geometry.scenes.reference.render",
+    "full_geometry.scenes.reference.render",
     "halfspace_sss.comparison.model_truths.truths_cost", "figures.parts.runner.completed_plans",
     "full_geometry.trade.flat.references", "full_geometry.trade.assessing.assess_stage",
     "full_geometry.trade.assessing.assess_for",

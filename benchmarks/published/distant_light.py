@@ -28,11 +28,12 @@ import numpy as np
 import torch
 from torch import nn
 
+from benchmarks.fits import ADAM, CpuSchedule, Objective
 from full_geometry.geometry.points import SurfacePoint, place, surface_point, turned
 from full_geometry.geometry.rounding import ray_from
 from full_geometry.objects.objects import TranslucentObject
 from full_geometry.transport.exit_pairs import trace_exits
-from halfspace_sss.neural.training.fit import ADAM, CpuSchedule, Descent, Objective, Source, fit
+from halfspace_sss.neural.training.fit import Descent, Source, fit
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.tracing.walk import generator, pass_seed
 

@@ -17,13 +17,14 @@ import numpy as np
 import torch
 import zuko
 
+from benchmarks.fits import ADAM, CpuSchedule, Objective
 from benchmarks.published.paper_network import placed
 from full_geometry.geometry.mesh import face_vertices, vertex_positions
 from full_geometry.geometry.points import SurfacePoint, channel_mean, cosine_above, place, surface_point
 from full_geometry.objects.objects import TranslucentObject
 from full_geometry.transport.features import ObjectFrame
 from full_geometry.transport.one_object import FullGeometry
-from halfspace_sss.neural.training.fit import ADAM, CpuSchedule, Descent, Objective, fit
+from halfspace_sss.neural.training.fit import Descent, fit
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 HIDDEN, LAYERS = (128, 128), 6

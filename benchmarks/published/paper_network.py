@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from benchmarks.fits import ADAM, CpuSchedule, Objective
 from full_geometry.geometry.points import SurfacePoint
 from full_geometry.learning.model_errors import LOBES, POWER, ExitRadiance
 from full_geometry.objects.objects import TranslucentObject
@@ -20,7 +21,7 @@ from full_geometry.transport.exit_pairs import trace_exits
 from full_geometry.transport.features import ObjectFrame
 from full_geometry.transport.storing import frame_of
 from halfspace_sss.checks import check_count
-from halfspace_sss.neural.training.fit import ADAM, CpuSchedule, Descent, Objective, Source, fit
+from halfspace_sss.neural.training.fit import Descent, Source, fit
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.tracing.walk import generator, pass_seed
 

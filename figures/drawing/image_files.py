@@ -1,4 +1,4 @@
-"""The files of a figure of images, and the images of a thing against those of walks."""
+"""The files of a figure of images, names of methods in them, and the images of a thing against those of walks."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
+from figures.computing.contenders import VOLUMES, WALK
 from figures.computing.images import FLIP, Shot
 from figures.computing.references import against, reference_shot
 from figures.drawing.image_grid import image_grid
-from figures.drawing.labels import label
 from figures.drawing.page import page
 from figures.parts.part import Result
 from figures.parts.records import Row
-from halfspace_sss.comparison.style import paper, saved
+from halfspace_sss.comparison.style import look, paper, saved
 
 
 def image_files(
@@ -42,6 +42,16 @@ def image_files(
     files[f"{figure}.csv"] = pandas.DataFrame(rows).to_csv(index=False, lineterminator="\n")
     files[f"{figure}.html"] = page(title, scenes, notes=notes)
     return files
+
+
+def label(method: str) -> str:
+    """The name of a method as people read it."""
+    if method in VOLUMES:
+        kind, rr_depth = method.split()
+        return f"Mitsuba {kind}, roulette from {rr_depth}"
+    if method == WALK:
+        return "Our walk"
+    return "Neural half-space" if method == "neural" else look(method).label
 
 
 def rows_of(scenes: Mapping[str, Sequence[Shot]], key: str) -> list[Row]:

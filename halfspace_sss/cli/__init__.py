@@ -1,1 +1,1 @@
-"""Commands of the plane, one file each: curves, maps, bench, validate, lists of materials and models."""
+"""Commands of the plane, one file each: curves, maps, validate, lists of materials and models."""

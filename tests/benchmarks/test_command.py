@@ -15,6 +15,7 @@ from benchmarks.__main__ import COMMANDS, app  # noqa: E402
 
 WRONG = {
     "ablation": ["marbel"],
+    "bench": ["--only", "nope"],
     "figures": ["all", "marbel"],
     "gathered": ["--object", "marbel"],
     "inversion": ["--size", "0"],

@@ -128,7 +128,7 @@ def test_an_output_folder_that_is_a_file_is_refused_before_tracing(tmp_path: Pat
     assert "folder must be a folder or new" in result.stderr
 
 
-@pytest.mark.parametrize("command", ["bench", "curves", "maps"])
+@pytest.mark.parametrize("command", ["curves", "maps"])
 def test_a_folder_that_cannot_be_written_to_is_refused_before_any_work(command: str, monkeypatch: Any) -> None:
     def refuse(dir: Path) -> None:
         raise PermissionError(13, "Permission denied", str(dir))
@@ -234,7 +234,7 @@ def test_the_version_is_that_of_the_package() -> None:
 
 def test_help_names_every_command() -> None:
     text = _invoke("--help").stdout
-    for name in ("bench", "curves", "maps", "materials", "models", "validate"):
+    for name in ("curves", "maps", "materials", "models", "validate"):
         assert name in text
 
 

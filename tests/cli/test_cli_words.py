@@ -113,19 +113,10 @@ def test_work_that_fails_does_not_end_at_100_per_cent(monkeypatch: Any, capsys: 
     assert _progress([(0, 0), (1, 5)], monkeypatch, capsys, error=True) == []
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ["errors", "materials", "--model", "better_dipole", "--events", "1e4"],
-        pytest.param(["bench", "--quick", "--only", "models", "--only", "walk"], marks=pytest.mark.slow),
-    ],
-    ids=["errors", "bench"],
-)
-def test_progress_passes_every_part_of_the_work_and_ends_with_it(
-    arguments: list[str], tmp_path: Path, monkeypatch: Any
-) -> None:
+def test_progress_passes_every_part_of_the_work_and_ends_with_it(tmp_path: Path, monkeypatch: Any) -> None:
     seen = []
     monkeypatch.setattr(shared.Bar, "show", lambda self, done, total, text="": seen.append((done / total, text)))
+    arguments = ["errors", "materials", "--model", "better_dipole", "--events", "1e4"]
     assert _invoke(*arguments, "--out", str(tmp_path)).exit_code == 0
     shares = [share for share, _ in seen]
     assert shares == sorted(shares) and shares[-1] == 1

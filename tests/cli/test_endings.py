@@ -17,7 +17,6 @@ from render_files import XML
 pytestmark = pytest.mark.slow
 
 SMALL = {  # a small run of each command, and what it refuses
-    "bench": (["--quick", "--only", "walk", "--out", "o"], ["--only", "nope"]),
     "curves": (["--paths", "4096", "--theta-i", "0", "--model", "better_dipole", "--out", "o"], ["marbel"]),
     "errors materials": (["--model", "better_dipole", "--events", "1e4", "--out", "o"], ["marbel"]),
     "errors object": (["--scene", "ball.xml", "--model", "better_dipole", "--out", "o"], ["--scene", "none.xml"]),

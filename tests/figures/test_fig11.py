@@ -16,7 +16,7 @@ from figures.computing import timed
 from figures.computing.contenders import VOLUMES, contender
 from figures.computing.images import denoised, guides
 from figures.computing.timed import alternating, pass_size
-from figures.drawing.labels import label
+from figures.drawing.image_files import label
 from figures.parts.part import Part, Result, Task
 from halfspace_sss.backend import BackendError
 

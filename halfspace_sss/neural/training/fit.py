@@ -1,6 +1,6 @@
 """Fitting of a learner, whatever it learns from: Adam, and checkpoints from which a killed run goes on bit for bit.
 
-A schedule says how long, for a number of steps or of CPU seconds, and at which rate.
+A schedule says how long, and at which rate.
 """
 
 from __future__ import annotations
@@ -99,50 +99,7 @@ class Fit:
         return spent.steps, self.steps
 
 
-@dataclass(frozen=True)
-class CpuSchedule:
-    """CPU seconds of this process, data included, or a number of steps where the end is to be the same every time.
-
-    Args:
-        seconds: of CPU time.
-        steps: instead of them.
-        rate: largest learning rate.
-        warm_up: steps over which it rises.
-        last: part of it at the end of a cosine; 1 for a rate that stays.
-
-    Raises:
-        ValueError: an argument is out of range.
-    """
-
-    seconds: float
-    steps: int | None = None
-    rate: float = 4e-3
-    warm_up: int = 1
-    last: float = 1.0
-
-    per_step = 1
-    checkpoint_every = math.inf
-    validate_every = 1
-
-    def __post_init__(self) -> None:
-        check_interval("seconds", self.seconds, 1e-3, 1e6)
-        check_interval("rate", self.rate, 1e-8, 1.0)
-        check_count("steps", 1 if self.steps is None else self.steps, 1)
-
-    def share(self, spent: Spent) -> float:
-        return spent.cpu_seconds / self.seconds if self.steps is None else spent.steps / self.steps
-
-    def rate_at(self, spent: Spent) -> float:
-        return cosine(self.rate * warm_up(spent.steps, self.warm_up), self.share(spent), self.last)
-
-    def done(self, spent: Spent) -> tuple[int, int]:
-        if self.steps is not None:
-            return spent.steps, self.steps
-        return min(int(spent.cpu_seconds), int(self.seconds)), int(self.seconds)
-
-
 BETAS, CLIP = (0.9, 0.99), 1.0
-ADAM = (0.9, 0.999)  # the betas of Kingma and Ba 2015, which published networks are fitted with
 Batch = object  # what a source gives and its learner takes
 Source = Callable[[torch.Generator], Batch]  # the next batch; all chance in it is drawn from the generator
 
@@ -153,17 +110,6 @@ class Learnable(Protocol):
     def parameters(self) -> Iterable[torch.nn.Parameter]: ...
 
     def loss(self, batch: Batch) -> torch.Tensor: ...
-
-
-@dataclass(frozen=True, eq=False)
-class Objective:
-    """A module as a learner, with its loss for a batch."""
-
-    module: torch.nn.Module
-    loss: Callable[[Batch], torch.Tensor]
-
-    def parameters(self) -> Iterable[torch.nn.Parameter]:
-        return self.module.parameters()
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""The command `halfspace-sss bench`: what the walk, Mitsuba's volpath, the models and maps cost here."""
+"""The study `bench`: what the walk, Mitsuba's volpath, the models and maps cost here."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def bench(
     out: shared.OutFolder = Path("bench"),
 ) -> None:
     """Measure speed: events and paths per second, equal-error time of volpath, evaluations of models, maps."""
-    from halfspace_sss.comparison.bench import machine, peak_memory
+    from benchmarks.bench import machine, peak_memory
     from halfspace_sss.provenance import check_folder, provenance, write_together
 
     parts, notes = chosen_parts(only), []
@@ -102,15 +102,15 @@ def _measured(parts: list[str], quick: bool) -> dict[str, list[dict]]:
 
 def _lengths(quick: bool) -> dict[str, int]:
     """Number of rows of each part."""
+    from benchmarks.bench import MAP_MEDIA, MEDIA, ROULETTE_DEPTHS
     from halfspace_sss import models
-    from halfspace_sss.comparison.bench import MAP_MEDIA, MEDIA, ROULETTE_DEPTHS
 
     media, depths, maps = (1 if quick else len(each) for each in (MEDIA, ROULETTE_DEPTHS, MAP_MEDIA))
     return {"walk": 2 * media, "volpath": media * depths, "models": len(models()), "maps": maps}
 
 
 def _rows(part: str, quick: bool, tables: dict[str, list[dict]]) -> Iterator[dict]:
-    from halfspace_sss.comparison import bench
+    from benchmarks import bench
     from halfspace_sss.maps.grid import MapGrid
 
     if part == "walk":

@@ -220,3 +220,14 @@ def machine() -> dict[str, int | str | None]:
     except (OSError, StopIteration):
         processor = platform.processor() or platform.machine()
     return {"processor": processor, "threads": os.cpu_count(), "system": f"{platform.system()} {platform.machine()}"}
+
+
+def kernel_seconds(make: Callable[[], object]) -> float:
+    """Seconds in which the kernels run that compute what `make` returns, without tracing and compiling them."""
+    import drjit as dr
+
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        dr.eval(make())
+        dr.sync_thread()
+        return 1e-3 * sum(kernel["execution_time"] for kernel in dr.kernel_history([dr.KernelType.JIT]))

@@ -1,4 +1,4 @@
-"""The command `bench`: what it measures, prints and writes, and how it ends."""
+"""The study `bench`: what it measures, prints and writes, and how it ends."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import pytest
 from typer.testing import CliRunner
 
 import halfspace_sss
-from figures import app as cli
-from halfspace_sss.cli import bench as cli_bench
+from benchmarks import __main__ as cli
+from benchmarks import bench_command as cli_bench
 
 
 def _invoke(*arguments: str) -> Any:
