@@ -38,8 +38,7 @@ from figures.computing.modelled import VIEWS
 from figures.computing.scenes import BUNNY, MATERIALS, SCANS, prepare
 from figures.computing.timed import TimedRender, alternating, rendered
 from figures.modelling.objects import TISSUES, VARYING, tissue
-from figures.parts.part import Part, Result, Task, unmodelled
-from figures.parts.records import Params, SceneDict
+from figures.parts.part import Params, Part, Result, SceneDict, Task
 from halfspace_sss import materials
 from halfspace_sss.checks import check_choice
 from halfspace_sss.physics.medium import Medium
@@ -106,7 +105,6 @@ def modelled_contender(
     return ready(method, result, p["object"], tissue("candle wax").medium)  # all tissues scatter isotropically
 
 
-@unmodelled
 def long_modelled(task: Task) -> dict[str, object]:
     """A long image by our walk, for the parameters of `modelled_contender` and "spp" and "seed"."""
     prepare()

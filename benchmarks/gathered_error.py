@@ -15,7 +15,7 @@ from figures.computing.contenders import WALK
 from figures.computing.images import cover
 from figures.computing.scenes import prepare
 from figures.computing.timed import rendered
-from figures.parts.records import Row
+from figures.parts.part import Row
 from full_geometry.integrators.gathering import Gathering
 from halfspace_sss.neural.store import weights_in
 

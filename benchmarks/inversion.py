@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from benchmarks.inversion_textures import rms
-from figures.parts.records import Row, SceneDict
+from figures.parts.part import Row, SceneDict
 from full_geometry import inverse
 from full_geometry.inverse.views import GivenView
 from full_geometry.scenes.mitsuba_scene import with_media

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from benchmarks.tables import markdown
-from figures.parts.records import Row
+from figures.parts.part import Row
 from full_geometry.cli.variants import use_mitsuba
 from halfspace_sss.checks import check_choice, check_count
 from halfspace_sss.cli.shared import Bar, OutFolder, console, whole

@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.published import deng
 from figures.beyond.textures import bands, mosaic
 from figures.computing.scenes import BUNNY, MM_PER_UNIT
-from figures.parts.records import Row, SceneDict
+from figures.parts.part import Row, SceneDict
 from full_geometry import inverse
 from full_geometry.geometry.mesh import vertex_positions
 from full_geometry.inverse.views import GivenView

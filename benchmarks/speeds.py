@@ -26,7 +26,7 @@ from figures.computing.modelled import VIEWS
 from figures.computing.scenes import SCANS, prepare, scan_scene, surroundings
 from figures.computing.timed import TimedRender, alternating, rendered
 from figures.modelling.objects import VARYING, tissue
-from figures.parts.records import Row, SceneDict
+from figures.parts.part import Row, SceneDict
 from full_geometry.learning.meshes import surface
 from halfspace_sss import materials
 from halfspace_sss.neural.store import weights_in

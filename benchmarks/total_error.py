@@ -26,7 +26,7 @@ from benchmarks.speeds import VOLUMES, LitObject
 from figures.computing.contenders import ready
 from figures.computing.images import cover, denoised, guides
 from figures.computing.scenes import prepare
-from figures.parts.records import Row
+from figures.parts.part import Row
 from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
 
 SAMPLED, PRECOMPUTED = "walk, light sampled", "walk, light precomputed"

@@ -18,8 +18,7 @@ from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training
 from figures.computing.scenes import BUNNY, MM_PER_UNIT, bunny_scene, prepare
 from figures.drawing.page import page
 from figures.drawing.trade_plot import image_shots
-from figures.parts.part import Part, Result, Task
-from figures.parts.records import Params, SceneDict
+from figures.parts.part import Params, Part, Result, SceneDict, Task
 from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.trade.techniques import GATHERED, LAMBERT, Technique
 from halfspace_sss import materials

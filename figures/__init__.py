@@ -21,10 +21,10 @@ A `Part` is a name, parameters ready for JSON, a function and its estimated work
 
 - Arrays of shape (height, width) or (height, width, 3) are kept as float32 EXR; everything else must be ready for
   JSON. Both are checked: a NaN is refused with the name of the part.
-- A part is computed again when its parameters, the code of its function or a file that it imports from this project,
-  any model (they are found by name; not if it is `unmodelled`), the content of a file in `inputs` (weights, scenes), or
-  a part in `needs` changed; not when comments or `work` did. A part that is damaged is computed again and named. One
-  that another figure has in the same quality, as trainings of the same object are, is taken from there.
+- A part is computed again when its parameters, the content of a file in `inputs` (weights, scenes), a part in `needs`
+  or any code changed: that of the packages but for commands and drawing, and of the module of its function but for
+  `draw`. A part that is damaged is computed again and named in a warning. One that another figure has in the same
+  quality, as trainings of the same object are, is taken from there.
 - `needs` names parts that stand before it in the list; their results are in `task.needed`. `task.folder` is kept
   until the part is done: passes of a long render stored there survive an interruption.
 - For images: `figures.computing.images.compared` makes shots with FLIP, relMSE and maps from results;

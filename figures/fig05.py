@@ -12,8 +12,7 @@ import numpy as np
 from figures.computing.contenders import long_walk
 from figures.computing.images import FLIP, RELATIVE_MSE, compared
 from figures.computing.scenes import BUNNY, bunny_scene, prepare
-from figures.parts.part import Part, Result, Task
-from figures.parts.records import Params, Row
+from figures.parts.part import Params, Part, Result, Row, Task
 from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.learning import online
 from full_geometry.learning.online import combined

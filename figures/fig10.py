@@ -8,8 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from figures.computing.learnt import accepting, weight_files
-from figures.parts.part import Part, Result, Task, unmodelled
-from figures.parts.records import Params
+from figures.parts.part import Params, Part, Result, Task
 from halfspace_sss.comparison.curve_set import Curve, CurveSet
 from halfspace_sss.comparison.reflectance_curves import FIG10_THETA_I, curves
 from halfspace_sss.materials import load
@@ -34,7 +33,6 @@ def parts(quality: str) -> list[Part]:
     ]
 
 
-@unmodelled
 def traced_curves(task: Task) -> dict[str, object]:
     """The path-traced curve of one angle."""
     p = task.params

@@ -13,8 +13,7 @@ from figures.computing.references import NOTE, against, long_reference, referenc
 from figures.computing.scenes import BUNNY, prepare
 from figures.computing.timed import TimedRender, alternating, pass_size
 from figures.drawing.image_files import image_files, label
-from figures.parts.part import Part, Result, Task
-from figures.parts.records import Row
+from figures.parts.part import Part, Result, Row, Task
 from halfspace_sss import materials
 
 TITLE = "path tracing and ours in equal time, raw and denoised, with FLIP"

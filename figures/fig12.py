@@ -14,8 +14,7 @@ from figures.computing.learnt import shape_of
 from figures.computing.references import reference_image
 from figures.computing.scenes import BUNNY, bunny_scene, prepare
 from figures.drawing.image_files import image_files
-from figures.parts.part import Part, Result, Task
-from figures.parts.records import Params
+from figures.parts.part import Params, Part, Result, Task
 from halfspace_sss.neural.store import weights_in
 
 if TYPE_CHECKING:

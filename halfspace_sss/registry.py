@@ -7,8 +7,7 @@ a whole, or left out with a warning.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from typing import Any
 
 from halfspace_sss.checks import did_you_mean
@@ -67,15 +66,11 @@ def bssrdf(name: str, medium: Medium) -> BSSRDF:
 
 def model_class(name: str) -> type[BSSRDF]:
     """The class of a model; ValueError with the nearest name if there is none."""
-    check_allowed(name)
     known = {**_installed(), **_registered}
     if name not in known:
         hint = did_you_mean(name, list(known)) + "; `render` and `errors object` take models of objects"
         raise ValueError(f"model must be one of {', '.join(known)}, got {name!r}{hint}")
     return known[name]
-
-
-_closed_for: list[str] = []
 
 
 def check_model_class(cls: Any, base: type) -> None:
@@ -87,22 +82,6 @@ def check_model_class(cls: Any, base: type) -> None:
         raise ValueError(f"name of a model must be a text that is not empty, got {name!r}")
     if orders not in ("multiple", "total"):
         raise ValueError(f"orders of a model must be multiple or total, got {orders!r}")
-
-
-@contextmanager
-def no_models(who: str) -> Iterator[None]:
-    """Within it, in every thread, asking for a model by its name is an error: `who` is known to need none."""
-    _closed_for.append(who)
-    try:
-        yield
-    finally:
-        _closed_for.pop()
-
-
-def check_allowed(name: str) -> None:
-    """RuntimeError within `no_models`."""
-    if _closed_for:
-        raise RuntimeError(f"{_closed_for[-1]} is declared to find no model by name, and asks for {name!r}")
 
 
 def listed_models(base: type) -> dict[str, type]:

@@ -29,7 +29,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from benchmarks.published.photographs import Studio
-from figures.parts.records import SceneDict
+from figures.parts.part import SceneDict
 from full_geometry.geometry.mesh import face_vertices, vertex_positions
 from halfspace_sss.progress import Progress
 

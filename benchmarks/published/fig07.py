@@ -23,8 +23,7 @@ from figures.drawing.image_files import image_files
 from figures.fig01 import LIGHT, RESOLUTION, SIZES, TRUTH, shown
 from figures.fig01 import SPP as OURS_SPP
 from figures.modelling.objects import TISSUES
-from figures.parts.part import Part, Result, Task
-from figures.parts.records import SceneDict
+from figures.parts.part import Part, Result, SceneDict, Task
 from halfspace_sss.provenance import check_folder
 
 TITLE = "mandarin, meat, candle and croissant, path traced, by two rivals and ours, with FLIP"

@@ -9,8 +9,7 @@ import numpy as np
 
 from figures.computing.learnt import shape_of
 from figures.computing.scenes import BUNNY, prepare
-from figures.parts.part import Part, Result, Task
-from figures.parts.records import Params
+from figures.parts.part import Params, Part, Result, Task
 from halfspace_sss.comparison.style import COLUMN, paper, saved
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from figures.parts.records import SceneDict
+from figures.parts.part import SceneDict
 from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
 
 FAR, FOV = 5.0, 24.0  # distance of cameras over the radius of the object; degrees

@@ -16,8 +16,7 @@ from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training
 from figures.computing.scenes import BUNNY, MATERIALS
 from figures.drawing.image_files import label
 from figures.fig09 import LIGHTS, rendered
-from figures.parts.part import Part, Result
-from figures.parts.records import Row
+from figures.parts.part import Part, Result, Row
 from halfspace_sss import materials
 
 TITLE = "time of training and rendering, samples and size of weights, the paper's beside"

@@ -13,8 +13,7 @@ from figures.computing.references import NOTE, against, long_reference, referenc
 from figures.computing.scenes import BUNNY, prepare, scan_scene
 from figures.computing.timed import gathered_anew, power_of_two, rendered
 from figures.drawing.image_files import image_files
-from figures.parts.part import Part, Result, Task
-from figures.parts.records import Row
+from figures.parts.part import Part, Result, Row, Task
 from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
 from halfspace_sss.backend import clock
 

@@ -14,8 +14,7 @@ from figures.computing.things import Staging, lit_scene, shown, thing_parts, wal
 from figures.drawing.image_files import against_walks, image_files, rows_of
 from figures.modelling.head import make_head, write_painted
 from figures.modelling.leaf import LEAVES
-from figures.parts.part import Part, Result, Task, unmodelled
-from figures.parts.records import SceneDict
+from figures.parts.part import Part, Result, SceneDict, Task
 from full_geometry.learning.meshes import Box, box, make_shape, surface
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder
@@ -66,7 +65,6 @@ def learnt(task: Task) -> dict[str, object]:
     return trained(task, _scene(task), "thing")
 
 
-@unmodelled
 def path_traced(task: Task) -> dict[str, object]:
     """The image by random walks."""
     return walked(task, _scene)

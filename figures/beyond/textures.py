@@ -11,8 +11,7 @@ from figures.computing.references import NOTE
 from figures.computing.scenes import BUNNY, MM_PER_UNIT
 from figures.computing.things import Staging, lit_scene, shown, thing_parts, walked
 from figures.drawing.image_files import against_walks, image_files, rows_of
-from figures.parts.part import Part, Result, Task, unmodelled
-from figures.parts.records import SceneDict
+from figures.parts.part import Part, Result, SceneDict, Task
 from halfspace_sss.neural.universal import shipped_weights
 from halfspace_sss.provenance import check_folder
 
@@ -51,7 +50,6 @@ def parts(quality: str) -> list[Part]:
     return results
 
 
-@unmodelled
 def path_traced(task: Task) -> dict[str, object]:
     """The image by random walks."""
     return walked(task, _scene)

@@ -12,8 +12,7 @@ from figures.computing.scenes import DRAGON, SCANS
 from figures.computing.things import Staging, lit_scene, shown, thing_parts, walked
 from figures.drawing.image_files import against_walks, image_files, rows_of
 from figures.modelling.leaf import LEAVES
-from figures.parts.part import Part, Result, Task, unmodelled
-from figures.parts.records import SceneDict
+from figures.parts.part import Part, Result, SceneDict, Task
 from full_geometry.learning.meshes import TRAINING, make_shape
 from halfspace_sss import materials
 from halfspace_sss.provenance import check_folder
@@ -62,7 +61,6 @@ def parts(quality: str) -> list[Part]:
     return results
 
 
-@unmodelled
 def path_traced(task: Task) -> dict[str, object]:
     """The image by random walks."""
     return walked(task, _scene)

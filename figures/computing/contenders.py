@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from figures.computing.scenes import long_render, prepare, scan_scene
-from figures.parts.part import Task, unmodelled
-from figures.parts.records import SceneDict
+from figures.parts.part import SceneDict, Task
 from full_geometry.transport.models import model_names
 from halfspace_sss import bssrdf
 from halfspace_sss.neural.symmetric import channels
@@ -96,7 +95,6 @@ def _volume_scene(description: SceneDict, name: str, medium: Medium, rr_depth: i
     return tuple(results)
 
 
-@unmodelled
 def long_walk(task: Task) -> dict[str, object]:
     """A long image by our walk, in passes that survive an interruption: what the other images are compared with.
 

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 from figures.computing.scenes import BUNNY, MM_PER_UNIT, SCANS, prepare, scan_scene
 from figures.modelling.candle import make_candle
 from figures.modelling.objects import candle_parts, learnable_parts, make_varying, tissue
-from figures.parts.part import Part, Result, Task
-from figures.parts.records import SceneDict
+from figures.parts.part import Part, Result, SceneDict, Task
 from halfspace_sss import bssrdf, materials, models
 from halfspace_sss.neural.store import weights_in
 from halfspace_sss.neural.symmetric import channels

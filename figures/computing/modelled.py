@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from figures.computing.scenes import environment
-from figures.parts.records import SceneDict
+from figures.parts.part import SceneDict
 
 FLOOR, GAP = (0.33, 0.3, 0.27), 0.02  # reflectance of the floor, and how far it lies below the lowest point, mm
 

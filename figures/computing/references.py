@@ -19,7 +19,7 @@ from figures.computing.images import (
     stops_of,
 )
 from figures.computing.scenes import long_render, prepare
-from figures.parts.part import Result, Task, unmodelled
+from figures.parts.part import Result, Task
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -59,7 +59,6 @@ def reference_image(task: Task, scene: mi.Scene, alone: mi.Scene | None = None) 
     return {"image": image.astype(np.float32), "cover": covered, **numbers}
 
 
-@unmodelled
 def long_reference(task: Task) -> dict[str, object]:
     """`reference_image` of a scanned object; the parameters are material, size, lights, spp, seed and any scan."""
     prepare()

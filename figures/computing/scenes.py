@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from figures.parts.part import Task
-from figures.parts.records import SceneDict
+from figures.parts.part import SceneDict, Task
 from figures.parts.store import read_exr
 from halfspace_sss.checks import check_choice
 from halfspace_sss.provenance import check_folder

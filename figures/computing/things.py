@@ -10,8 +10,7 @@ import numpy as np
 
 from figures.computing.references import reference_image
 from figures.computing.scenes import prepare
-from figures.parts.part import Part, Task
-from figures.parts.records import Params, SceneDict
+from figures.parts.part import Params, Part, SceneDict, Task
 
 
 class Staging(NamedTuple):

@@ -11,8 +11,7 @@ from figures.computing.images import FLIP, Shot
 from figures.computing.references import against, reference_shot
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
-from figures.parts.part import Result
-from figures.parts.records import Row
+from figures.parts.part import Result, Row
 from halfspace_sss.comparison.style import look, paper, saved
 
 

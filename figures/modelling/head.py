@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from figures.parts.records import SceneDict
+from figures.parts.part import SceneDict
 from full_geometry.learning.meshes import Box, Mesh, capsule, cut, ellipsoid, join, overlap, smoothstep, surface
 
 BOX = Box((-1.3, -2.1, -1.5), (1.3, 1.6, 1.6))

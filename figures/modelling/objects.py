@@ -11,7 +11,7 @@ import numpy as np
 
 from figures.modelling import varying
 from figures.modelling.candle import make_candle
-from figures.parts.records import SceneDict
+from figures.parts.part import SceneDict
 from full_geometry.learning.meshes import Box, Mesh, in_chunks, surface
 from halfspace_sss.materials.files import parse
 from halfspace_sss.materials.material import Material

@@ -70,12 +70,11 @@ def list_figures(chosen: FigureOptions) -> None:
         plans = chosen.plans()
     rows = []
     for p in plans:
-        counts = (len(p.parts), len(p.parts) - len(p.missing), len(p.damaged))
+        counts = (len(p.parts), len(p.parts) - len(p.missing))
         drawn = "yes" if (p.folder / f"{p.name}.json").exists() else "no"
         rows.append((p.name, figure(p.name).TITLE, *map(str, counts), _time(p), drawn))
-    headings = ("figure", "shows", "parts", "computed", "damaged", "time for the rest", "drawn")
+    headings = ("figure", "shows", "parts", "computed", "time for the rest", "drawn")
     say(table(headings, rows, title=f"quality {chosen.quality}, in {chosen.out}", left=2))
-    say(*(f"damaged: {reason}" for p in plans for reason in p.damaged.values()))
 
 
 Variant = Annotated[Literal["llvm_ad_rgb", "cuda_ad_rgb"], typer.Option(help="Variant of Mitsuba.")]
@@ -126,7 +125,7 @@ def _completed(chosen: FigureOptions, places: Places, variant: str) -> Iterator[
     started = time.perf_counter()
     with places.executor() as executor, Bar(plans[0].name if len(plans) == 1 else "figures") as bar:
         most = places.workers and AHEAD * places.workers
-        for p in completed_plans(plans, bar.show, say, executor, most):
+        for p in completed_plans(plans, bar.show, executor, most):
             with bar.standing():
                 yield p
     if any(p.missing for p in plans):

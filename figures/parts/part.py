@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import importlib
+import inspect
 import json
 import os
 import re
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,12 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from figures.parts.code import code_hash
 from halfspace_sss.checks import check_choice, check_interval
 from halfspace_sss.progress import Progress
-from halfspace_sss.registry import no_models
 
 QUALITIES = ("draft", "paper")
+COMPUTING = ("analytic_models", "figures.computing", "figures.modelling", "full_geometry", "halfspace_sss")
+Params = Mapping[str, Any]  # parameters, or numbers, of a part
+Row = dict[str, float | str | None]  # of a table
+SceneDict = dict[str, Any]  # a scene, or a part of it, as `mitsuba.load_dict` takes it
 
 
 @dataclass(frozen=True)
@@ -33,7 +38,7 @@ class Result:
     """
 
     images: Mapping[str, np.ndarray]
-    numbers: Mapping[str, Any]
+    numbers: Params
     seconds: float
     work: float
 
@@ -54,14 +59,14 @@ class Task:
         progress: called with (steps done, steps in all).
     """
 
-    params: Mapping[str, Any]
+    params: Params
     folder: Path
     needed: Mapping[str, Result] = field(default_factory=dict)
     inputs: tuple[Path, ...] = ()
     progress: Progress = _no_progress
 
 
-Function = Callable[[Task], Mapping[str, Any]]
+Function = Callable[[Task], Params]
 
 
 @dataclass(frozen=True)
@@ -83,7 +88,7 @@ class Part:
 
     name: str
     function: Function
-    params: Mapping[str, Any]
+    params: Params
     work: float
     needs: tuple[str, ...] = ()
     inputs: tuple[str | os.PathLike, ...] = ()
@@ -107,27 +112,6 @@ class Part:
         return f"{name}, {self.like}" if self.like else name
 
 
-_UNMODELLED: set[Function] = set()
-
-
-def unmodelled(function: Function) -> Function:
-    """Declare that a function of parts finds no model by name, as path tracing does not; one that does is stopped.
-
-    Its result then does not depend on the code of models.
-
-    Raises:
-        RuntimeError: from the function, when it asks for a model.
-    """
-
-    @functools.wraps(function)
-    def closed(task: Task) -> Mapping[str, Any]:
-        with no_models(f"{function.__module__}.{function.__qualname__}"):
-            return function(task)
-
-    _UNMODELLED.add(closed)
-    return closed
-
-
 def canonical(value: Any, what: str) -> str:
     """The one JSON text of a value; ValueError names `what` if it has none, as NaN has none."""
     try:
@@ -149,7 +133,6 @@ def keys_of(parts: Sequence[Part]) -> dict[str, str]:
             be read.
     """
     keys: dict[str, str] = {}
-    code: dict[Function, str] = {}
     slugs: dict[str, str] = {}
     for part in parts:
         if part.slug in slugs:
@@ -160,14 +143,38 @@ def keys_of(parts: Sequence[Part]) -> dict[str, str]:
         for name in part.needs:
             if name not in keys:
                 raise ValueError(f"part {part.name!r} must need parts that stand before it, got {name!r}")
-        function = part.function
-        if function not in code:  # many parts share it
-            code[function] = code_hash(function.__module__, function.__qualname__, function in _UNMODELLED)
-        about = {"function": function.__qualname__, "params": part.params, "code": code[function]}
+        about = {"function": part.function.__qualname__, "code": code_hash(part.function), "params": part.params}
         about |= {"inputs": [_file_hash(part, path) for path in part.inputs]}
         about |= {"needs": {name: keys[name] for name in part.needs}}
         keys[part.name] = hashlib.sha256(canonical(about, part.name).encode()).hexdigest()
     return keys
+
+
+@functools.cache
+def code_hash(function: Function) -> str:
+    """SHA-256 of all code that the result of a part may come from.
+
+    That of `COMPUTING` but for commands, and the module of the function, or its package where that is another one,
+    without what is called `draw`.
+    """
+    module = sys.modules[function.__module__]
+    text, draw = inspect.getsource(module), getattr(module, "draw", None)
+    digest = hashlib.sha256(text.replace(inspect.getsource(draw) if draw else "", "").encode())
+    home = module.__name__.partition(".")[0]
+    for package in (*COMPUTING, *([home] if home not in COMPUTING and home != "figures" else ())):
+        digest.update(_package_hash(package).encode())
+    return digest.hexdigest()
+
+
+@functools.cache
+def _package_hash(name: str) -> str:
+    """Of the files of a package, or of nothing for a module that is in none."""
+    digest = hashlib.sha256()
+    for folder in map(Path, getattr(importlib.import_module(name), "__path__", ())):
+        for path in sorted(folder.rglob("*.py")):
+            if "cli" not in path.relative_to(folder).parts:
+                digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 def _file_hash(part: Part, path: str | os.PathLike) -> str:

@@ -6,7 +6,7 @@ import functools
 import importlib
 import json
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +15,7 @@ from types import ModuleType
 
 import figures
 from figures.parts.part import QUALITIES, Part, Result, Task, check_quality, keys_of
-from figures.parts.store import DamagedPartError, PartStore
+from figures.parts.store import PartStore
 from halfspace_sss.checks import check_choice
 from halfspace_sss.executors import completed
 from halfspace_sss.progress import Progress, ProgressText
@@ -43,7 +43,6 @@ def duration(seconds: float) -> str:
 
 
 STEPS = 10_000  # of the bar
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -53,8 +52,7 @@ class Plan:
     Attributes:
         name, quality, folder: of the figure; its pictures go there, its parts below.
         parts, keys: in the order of computing; the hash of what each depends on, by name.
-        damaged: by name of a part that must be computed again because its files are not sound, what is wrong with them.
-        missing: names of the parts to be computed, those included.
+        missing: names of the parts to be computed.
         seconds: projected for each missing part that no other figure has, by name.
     """
 
@@ -63,7 +61,6 @@ class Plan:
     folder: Path
     parts: tuple[Part, ...]
     keys: Mapping[str, str]
-    damaged: Mapping[str, str]
     missing: tuple[str, ...]
     seconds: Mapping[str, float | None]
 
@@ -102,20 +99,13 @@ def plan(name: str, quality: str, out: str | Path) -> Plan:
     parts = tuple(module.parts(quality))
     keys = keys_of(parts)
     store = PartStore(folder / quality / "parts")
-    damaged, missing = {}, []
-    for part in parts:
-        try:
-            sound = store.holds(part, keys[part.name])
-        except DamagedPartError as error:
-            sound, damaged[part.name] = False, str(error)
-        if not sound:
-            missing.append(part.name)
-    ahead = [part for part in parts if part.name in missing and not _elsewhere(folder / quality, part, keys[part.name])]
+    missing = [part for part in parts if not store.holds(part, keys[part.name])]
+    ahead = [part for part in missing if not _elsewhere(folder / quality, part, keys[part.name])]
     seconds = projected(ahead, (PartStore(folder / each / "parts") for each in QUALITIES))
+    names = tuple(part.name for part in missing)
     return Plan(
-        name=name, quality=quality, folder=folder / quality, parts=parts, keys=keys, damaged=damaged,
-        missing=tuple(missing), seconds=seconds,
-    )  # fmt: skip
+        name=name, quality=quality, folder=folder / quality, parts=parts, keys=keys, missing=names, seconds=seconds
+    )
 
 
 def compute(
@@ -123,7 +113,6 @@ def compute(
     quality: str,
     out: str | Path,
     progress: ProgressText | None = None,
-    say: Say | None = None,
     executor: Executor | None = None,
 ) -> dict[str, Result]:
     """Compute what is missing, damaged or changed of a figure; finished parts survive an interruption.
@@ -131,7 +120,6 @@ def compute(
     Args:
         name, quality, out: as in `plan`.
         progress: called with (steps done, steps in all, name of the part).
-        say: called with a line for each part that was damaged.
         executor: where parts are computed and written (see `halfspace_sss.executors`); by default in this process.
 
     Returns:
@@ -141,7 +129,7 @@ def compute(
         ValueError: as in `plan`, or from a part, whose name it gives.
     """
     todo = plan(name, quality, out)
-    for _ in completed_plans([todo], progress, say, executor):
+    for _ in completed_plans([todo], progress, executor):
         pass
     return {part.name: todo.store.load(part, todo.keys[part.name]) for part in todo.parts}
 
@@ -149,7 +137,6 @@ def compute(
 def completed_plans(
     plans: Sequence[Plan],
     progress: ProgressText | None = None,
-    say: Say | None = None,
     executor: Executor | None = None,
     most: int | None = None,
 ) -> Iterator[Plan]:
@@ -157,7 +144,7 @@ def completed_plans(
 
     Args:
         plans: as `plan` makes them.
-        progress, say, executor: as in `compute`.
+        progress, executor: as in `compute`.
         most: parts that the executor is given at a time; all that can run by default.
 
     Raises:
@@ -165,10 +152,6 @@ def completed_plans(
     """
     if executor:
         plans = [replace(todo, folder=todo.folder.absolute()) for todo in plans]
-    for todo in plans:
-        for part, reason in todo.damaged.items():
-            if say:
-                say(f"{todo.name}: part {part!r} is damaged and computed again: {reason}")
     owners: dict[str, str] = {}  # names of the first parts of these keys
     weights, parts, needs, left = {}, {}, {}, {}
     done, measured = 0.0, not any(todo.unmeasured for todo in plans)
@@ -178,7 +161,7 @@ def completed_plans(
             progress(int(STEPS * (done + weights[name] * k / max(n, 1)) / sum(weights.values())), STEPS, told)
 
     for todo in plans:
-        known = {part: _named(todo, part) for part in todo.missing}
+        known = {part: f"{todo.name}, part {part!r}" for part in todo.missing}
         left[todo.name] = set(known.values())
         for part in (part for part in todo.parts if part.name in known):
             name, key = known[part.name], todo.keys[part.name]
@@ -196,11 +179,6 @@ def completed_plans(
             yield next(p for p in plans if p.name == todo)
 
 
-def _named(todo: Plan, part: str) -> str:
-    """What errors call a part."""
-    return f"{todo.name}, part {part!r}"
-
-
 def draw(name: str, quality: str, out: str | Path) -> list[Path]:
     """Draw a figure from its finished parts: writes OUT/NAME/QUALITY/FILE for every file, and NAME.json.
 
@@ -210,10 +188,9 @@ def draw(name: str, quality: str, out: str | Path) -> list[Path]:
     done = plan(name, quality, out)
     if done.missing:
         few = ", ".join(repr(part) for part in done.missing[:3]) + (", ..." if len(done.missing) > 3 else "")
-        reason = "".join(f"; {text}" for text in done.damaged.values())
         raise ValueError(
             f"parts of {name} must be computed before it is drawn, {len(done.missing)} of {len(done.parts)} are not: "
-            f"{few}{reason}; `halfspace-sss figures compute {name} --quality {quality}` does it"
+            f"{few}; `halfspace-sss figures compute {name} --quality {quality}` does it"
         )
     results = {part.name: done.store.load(part, done.keys[part.name]) for part in done.parts}
     content = dict(figure(name).draw(results))
@@ -240,13 +217,8 @@ def _weight(todo: Plan, part: Part, measured: bool) -> float:
 
 def _elsewhere(folder: Path, part: Part, key: str) -> PartStore | None:
     """Where another figure has the same part in the same quality: keys agree only where all that it depends on does."""
-    for place in sorted(folder.parent.parent.glob(f"*/{folder.name}/parts")):
-        try:
-            if PartStore(place).holds(part, key):
-                return PartStore(place)
-        except DamagedPartError:
-            continue
-    return None
+    places = (PartStore(place) for place in sorted(folder.parent.parent.glob(f"*/{folder.name}/parts")))
+    return next((store for store in places if store.holds(part, key)), None)
 
 
 def _computed(todo: Plan, name: str, show: Progress | None) -> tuple[str, str]:

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
 import re
 import shutil
-from collections.abc import Iterator, Mapping
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from figures.parts.part import Part, Result, canonical
+from figures.parts.part import Params, Part, Result, canonical
 from halfspace_sss.backend import BackendError, two_threads
-from halfspace_sss.provenance import provenance, write_together
+from halfspace_sss.provenance import JsonDict, provenance, write_together
 
 
 def _mitsuba() -> tuple[type, type]:
@@ -66,11 +67,7 @@ def read_exr(path: str | os.PathLike) -> np.ndarray:
         raise ValueError(f"{os.fspath(path)} must be an EXR image: {error}") from error
 
 
-FORMAT = 1
-
-
-class DamagedPartError(ValueError):
-    """A file of a finished part is missing or is not what its record says; the message names it."""
+FORMAT, RECORD = 1, "record.json"
 
 
 class PartStore:
@@ -83,51 +80,36 @@ class PartStore:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
-    def record(self, part: Part) -> dict[str, Any] | None:
-        """The checked record of a part, None if there is none; the images are not looked at.
-
-        Raises:
-            DamagedPartError: it cannot be read, or is not what was written.
-        """
-        path = self._record_path(part)
+    def holds(self, part: Part, key: str) -> bool:
+        """Whether there is a result of what `key` stands for; a warning names one whose files are damaged."""
         try:
-            record = json.loads(path.read_text(encoding="utf-8"))
-            checksum = record.pop("checksum")
-            sound = record["format"] == FORMAT and checksum == _checksum(record)
-        except FileNotFoundError:
-            return None
+            return self._record(part, key) is not None
         except (ValueError, KeyError, TypeError, AttributeError, OSError) as error:
-            raise DamagedPartError(f"{path} must be the record of a part: {type(error).__name__}: {error}") from error
-        if not sound:
-            raise DamagedPartError(f"{path} must be a record of format {FORMAT} with the checksum of its content")
+            warnings.warn(f"part {part.name!r} is damaged, {self.folder / part.slug}: {error}", stacklevel=2)
+            return False
+
+    def _record(self, part: Part, key: str) -> JsonDict | None:
+        """The record of a result, whose files are as they were written; None if there is none of that key."""
+        path = self.folder / part.slug / RECORD
+        if not path.exists():
+            return None
+        record = json.loads(path.read_text(encoding="utf-8"))
+        if record.pop("checksum") != _checksum(record) or record["format"] != FORMAT:
+            raise ValueError(f"{RECORD} must be of format {FORMAT} with the checksum of its content")
+        if record["key"] != key:
+            return None
+        for about in record["images"].values():
+            if hashlib.sha256(path.with_name(about["file"]).read_bytes()).hexdigest() != about["sha256"]:
+                raise ValueError(f"{about['file']} must have the checksum of its record")
         return record
 
-    def holds(self, part: Part, key: str) -> bool:
-        """Whether there is a result of what `key` stands for, with all its files as they were written.
-
-        Raises:
-            DamagedPartError: a file is missing or damaged.
-        """
-        record = self.record(part)
-        if record is None or record["key"] != key:
-            return False
-        for about in record["images"].values():
-            self._checked_image(part, about)
-        return True
-
-    def load(self, part: Part, key: str) -> Result | None:
-        """The result of a part, None if there is none of what `key` stands for.
-
-        Raises:
-            DamagedPartError: a file is missing or damaged.
-        """
-        record = self.record(part)
-        if record is None or record["key"] != key:
-            return None
-        images = {name: read_exr(self._checked_image(part, about)) for name, about in record["images"].items()}
+    def load(self, part: Part, key: str) -> Result:
+        """The result of a part that the store holds."""
+        record = self._record(part, key)
+        images = {name: read_exr(self.folder / part.slug / about["file"]) for name, about in record["images"].items()}
         return Result(images, record["numbers"], record["seconds"], record["work"])
 
-    def save(self, part: Part, key: str, values: Mapping[str, Any], seconds: float) -> Result:
+    def save(self, part: Part, key: str, values: Params, seconds: float) -> None:
         """Write what the function of a part returned; every file is whole or absent, the record comes last.
 
         Args:
@@ -138,67 +120,43 @@ class PartStore:
         Raises:
             ValueError: an array has a wrong shape or a value that is not finite, or something is not ready for JSON.
         """
+        folder, of = self.folder / part.slug, f"of part {part.name!r}"
         arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
         numbers = {name: value for name, value in values.items() if name not in arrays}
-        canonical(numbers, f"numbers of part {part.name!r}")
+        canonical(numbers, f"numbers {of}")
         for name in arrays:
             if not re.fullmatch(r"[\w-]+", name):
-                raise ValueError(f"images of part {part.name!r} must be named by letters, digits, _, -, got {name!r}")
+                raise ValueError(f"images {of} must be named by letters, digits, _, -, got {name!r}")
         origin = provenance(part=part.name, kind=part.kind, **part.params)
-        about = canonical({**origin, "key": key}, f"provenance of part {part.name!r}")
-        images = {name: exr_bytes(array, f"{name} of part {part.name!r}", about) for name, array in arrays.items()}
-        files = {f"{name}.exr": data for name, data in images.items()}
+        about = canonical({**origin, "key": key}, f"provenance {of}")
+        files = {f"{name}.exr": exr_bytes(array, f"{name} {of}", about) for name, array in arrays.items()}
         record = {"format": FORMAT, "part": part.name, "key": key, "kind": part.kind, "work": part.work}
         record |= {"seconds": seconds, "numbers": numbers, "provenance": origin}
         record["inputs"] = [Path(path).name for path in part.inputs]
         record["images"] = {
-            name: {"file": f"{name}.exr", "sha256": hashlib.sha256(data).hexdigest()} for name, data in images.items()
+            file.removesuffix(".exr"): {"file": file, "sha256": hashlib.sha256(data).hexdigest()}
+            for file, data in files.items()
         }
         record = json.loads(json.dumps(record))
-        text = json.dumps({**record, "checksum": _checksum(record)}, indent=1)
-        places = {self._part_folder(part) / file: data for file, data in files.items()}
-        write_together({**places, self._record_path(part): text + "\n"})
-        self._sweep(part, set(files))
-        shown = {name: array.astype(np.float32) for name, array in arrays.items()}
-        return Result(shown, record["numbers"], seconds, part.work)
+        text = json.dumps({**record, "checksum": _checksum(record)}, indent=1) + "\n"
+        write_together({folder / file: data for file, data in {**files, RECORD: text}.items()})
+        for path in folder.iterdir():  # of an earlier result, or of the way to this one
+            if path.name.startswith("unfinished-"):
+                shutil.rmtree(path, ignore_errors=True)
+            elif path.suffix == ".exr" and path.name not in files:
+                path.unlink()
 
     def unfinished(self, part: Part, key: str) -> Path:
         """Folder in which a part keeps what it has done so far; another key has another one."""
-        return self._part_folder(part) / f"unfinished-{key[:16]}"
+        return self.folder / part.slug / f"unfinished-{key[:16]}"
 
     def seconds(self) -> Iterator[tuple[str, float, float]]:
-        """Kind, work and seconds of every part that has a sound record."""
-        for path in sorted(self.folder.glob("*/record.json")):
-            try:
+        """Kind, work and seconds of every part that has a readable record."""
+        for path in sorted(self.folder.glob(f"*/{RECORD}")):
+            with contextlib.suppress(ValueError, KeyError, TypeError, OSError):  # it is not worth an error
                 record = json.loads(path.read_text(encoding="utf-8"))
                 yield record["kind"], float(record["work"]), float(record["seconds"])
-            except (ValueError, KeyError, TypeError, OSError):
-                continue  # what a damaged record says of time is not worth an error
-
-    def _part_folder(self, part: Part) -> Path:
-        return self.folder / part.slug
-
-    def _record_path(self, part: Part) -> Path:
-        return self._part_folder(part) / "record.json"
-
-    def _checked_image(self, part: Part, about: Mapping[str, str]) -> Path:
-        path = self._part_folder(part) / about["file"]
-        try:
-            data = path.read_bytes()
-        except OSError as error:
-            raise DamagedPartError(f"{path} must be an image of part {part.name!r}: {error.strerror}") from error
-        if hashlib.sha256(data).hexdigest() != about["sha256"]:
-            raise DamagedPartError(f"{path} must have the checksum of its record, got a changed or cut file")
-        return path
-
-    def _sweep(self, part: Part, keep: set[str]) -> None:
-        """Remove what belonged to an earlier result or to the way to this one."""
-        for path in self._part_folder(part).iterdir():
-            if path.name.startswith("unfinished-"):
-                shutil.rmtree(path, ignore_errors=True)
-            elif path.suffix == ".exr" and path.name not in keep:
-                path.unlink()
 
 
-def _checksum(record: Mapping[str, Any]) -> str:
+def _checksum(record: JsonDict) -> str:
     return hashlib.sha256(canonical(record, "record").encode()).hexdigest()

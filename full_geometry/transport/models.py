@@ -18,7 +18,7 @@ from full_geometry.settings import AUTO, PATH_TRACED, Capabilities
 from halfspace_sss.checks import check_choice
 from halfspace_sss.extensions import TRANSPORTS, offers
 from halfspace_sss.lazy import once
-from halfspace_sss.registry import check_allowed, model_class, models
+from halfspace_sss.registry import model_class, models
 
 if TYPE_CHECKING:
     from full_geometry.geometry.points import ObjectModel
@@ -46,12 +46,10 @@ class ModelEntry:
         """The function that binds it to an object; None for a half-space model.
 
         Raises:
-            RuntimeError: within `halfspace_sss.registry.no_models`.
             ValueError: `make` is no function.
         """
         if self.capabilities.of_half_space:
             return None
-        check_allowed(self.name)
         make = self.make
         if isinstance(make, str):
             module, _, function = make.partition(":")

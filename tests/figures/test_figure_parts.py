@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import linecache
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,7 +16,8 @@ import figures
 from figures.computing.images import Shot, absent, compared
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
-from figures.parts.part import Part, Result, Task, keys_of
+from figures.parts import part as parts_module
+from figures.parts.part import Part, Result, Task, code_hash, keys_of
 from figures.parts.runner import compute, draw, duration
 from figures.parts.store import exr_bytes, read_exr
 from halfspace_sss.comparison.style import paper, saved
@@ -39,6 +42,32 @@ def shade(task: Task) -> dict[str, Any]:
 def test_badly_formed_parts_are_refused(make: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_keys_follow_code_that_computes_and_not_what_draws(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a package that the figures compute with, and of the package of the function."""
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(parts_module, "COMPUTING", ("toy_library",))
+    for name in ("toy_library/__init__", "toy_library/cli/render", "toy_library/inner/walk", "toy_figures/__init__"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / f"{name}.py").write_text("x = 1\n")
+    (tmp_path / "toy_figures/fig.py").write_text("def part(task):\n    return {}\n\n\ndef draw(r):\n    return {}\n")
+
+    def keyed() -> str:
+        for name in [name for name in sys.modules if name.startswith("toy_")]:
+            del sys.modules[name]
+        linecache.clearcache()
+        code_hash.cache_clear()
+        parts_module._package_hash.cache_clear()
+        return keys_of([Part("p", importlib.import_module("toy_figures.fig").part, {}, 1)])["p"]
+
+    keys = [keyed()]
+    for name, text in (("toy_library/cli/render", "x = 2\n"), ("toy_library/inner/walk", "x = 2\n")):
+        (tmp_path / f"{name}.py").write_text(text)
+        keys.append(keyed())
+    assert keys[0] == keys[1] != keys[2]
+    (tmp_path / "toy_figures/__init__.py").write_text("x = 2\n")
+    assert keyed() not in keys
 
 
 @pytest.mark.parametrize("shape", [(3, 5), (3, 5, 3)])
