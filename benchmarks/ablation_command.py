@@ -11,8 +11,7 @@ import typer
 
 from halfspace_sss.backend import array_types
 from halfspace_sss.cli.shared import Backend, Bar, MediumOptions, OutFolder, Places, console, whole
-from halfspace_sss.kept_rows import KeptRows
-from halfspace_sss.provenance import JsonDict, check_folder, provenance, write_together
+from halfspace_sss.provenance import JsonDict, KeptRows, check_folder, provenance, write_together
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -85,7 +84,7 @@ def ablation_command(
 
 def _medium(name: str | None, channel: str | None, options: MediumOptions) -> tuple[str, Medium]:
     """A title and a scalar medium."""
-    from halfspace_sss.materials.registry import one_channel
+    from halfspace_sss.materials.catalogue import one_channel
 
     stated = options.stated([name] if name else [])
     if stated is None:

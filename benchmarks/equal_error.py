@@ -34,9 +34,9 @@ from figures.computing.learnt import (
     weight_files,
     with_weights,
 )
-from figures.computing.modelled import VIEWS
-from figures.computing.scenes import BUNNY, MATERIALS, SCANS, prepare
+from figures.computing.scans import BUNNY, MATERIALS, SCANS, prepare
 from figures.computing.timed import TimedRender, alternating, rendered
+from figures.fig01 import VIEWS
 from figures.modelling.objects import TISSUES, VARYING, tissue
 from figures.parts.part import Params, Part, Result, SceneDict, Task
 from halfspace_sss import materials

@@ -13,7 +13,7 @@ import pandas
 from benchmarks.speeds import LitObject, scene_of, train
 from figures.computing.contenders import WALK
 from figures.computing.images import cover
-from figures.computing.scenes import prepare
+from figures.computing.scans import prepare
 from figures.computing.timed import rendered
 from figures.parts.part import Row
 from full_geometry.integrators.gathering import Gathering

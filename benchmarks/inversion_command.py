@@ -15,8 +15,7 @@ from figures.parts.part import Row
 from full_geometry.cli.variants import use_mitsuba
 from halfspace_sss.checks import check_choice, check_count
 from halfspace_sss.cli.shared import Bar, OutFolder, console, whole
-from halfspace_sss.kept_rows import KeptRows
-from halfspace_sss.provenance import check_folder, write_together
+from halfspace_sss.provenance import KeptRows, check_folder, write_together
 
 TABLES = ("media", "textures", "gradients")
 

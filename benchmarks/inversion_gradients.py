@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from figures.computing.scenes import SCANS, scan_scene
+from figures.computing.scans import SCANS, scan_scene
 from full_geometry.scenes.mitsuba_scene import with_media
 from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
 from halfspace_sss.progress import NamedProgress

@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.published import deng
 from figures.beyond.textures import bands, mosaic
-from figures.computing.scenes import BUNNY, MM_PER_UNIT
+from figures.computing.scans import BUNNY, MM_PER_UNIT
 from figures.parts.part import Row, SceneDict
 from full_geometry import inverse
 from full_geometry.geometry.mesh import vertex_positions

@@ -22,9 +22,9 @@ from benchmarks.hand_and_ribbon import SHAPES
 from figures.computing.contenders import WALK, ready, volume
 from figures.computing.images import cover
 from figures.computing.learnt import object_parts
-from figures.computing.modelled import VIEWS
-from figures.computing.scenes import SCANS, prepare, scan_scene, surroundings
+from figures.computing.scans import SCANS, prepare, scan_scene, surroundings
 from figures.computing.timed import TimedRender, alternating, rendered
+from figures.fig01 import VIEWS
 from figures.modelling.objects import VARYING, tissue
 from figures.parts.part import Row, SceneDict
 from full_geometry.learning.meshes import surface

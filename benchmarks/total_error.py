@@ -25,7 +25,7 @@ import pandas
 from benchmarks.speeds import VOLUMES, LitObject
 from figures.computing.contenders import ready
 from figures.computing.images import cover, denoised, guides
-from figures.computing.scenes import prepare
+from figures.computing.scans import prepare
 from figures.parts.part import Row
 from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
 

@@ -15,7 +15,7 @@ from benchmarks.long_runs import assessment_of
 from benchmarks.trade_tables import markdown, multiples, trade_table
 from figures.computing.contenders import OF_OBJECTS
 from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training_of, weight_files, with_weights
-from figures.computing.scenes import BUNNY, MM_PER_UNIT, bunny_scene, prepare
+from figures.computing.scans import BUNNY, MM_PER_UNIT, bunny_scene, prepare
 from figures.drawing.page import page
 from figures.drawing.trade_plot import image_shots
 from figures.parts.part import Params, Part, Result, SceneDict, Task

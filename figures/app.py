@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -116,7 +116,7 @@ def make() -> typer.Typer:
     return app
 
 
-def _check_command(name: str, function: Any) -> None:
+def _check_command(name: str, function: Callable) -> None:
     """Raises, in whichever way typer does, if the function cannot be a command beside the others."""
     if name in SINGLE or name in GROUPS:
         raise ValueError(f"name must be new, got {name!r}")

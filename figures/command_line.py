@@ -15,7 +15,7 @@ def main() -> None:
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")
     from figures.app import app
-    from halfspace_sss.cli.interrupts import interrupts
+    from halfspace_sss.interrupts import interrupts
 
     with interrupts:
         try:
@@ -34,8 +34,8 @@ def _end(*_: object) -> NoReturn:
 
 def _leave(end: BaseException) -> NoReturn:
     """End at once: Mitsuba's and Dr.Jit's own ends are not made for the middle of work."""
-    from halfspace_sss.cli.interrupts import interrupts
     from halfspace_sss.cli.shared import tell_interrupt
+    from halfspace_sss.interrupts import interrupts
 
     if not interrupts.told:
         tell_interrupt(end)

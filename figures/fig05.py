@@ -11,7 +11,7 @@ import numpy as np
 
 from figures.computing.contenders import long_walk
 from figures.computing.images import FLIP, RELATIVE_MSE, compared
-from figures.computing.scenes import BUNNY, bunny_scene, prepare
+from figures.computing.scans import BUNNY, bunny_scene, prepare
 from figures.parts.part import Params, Part, Result, Row, Task
 from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.learning import online

@@ -10,7 +10,7 @@ from figures.computing import contenders
 from figures.computing.images import Shot
 from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training_of, weight_files, with_weights
 from figures.computing.references import NOTE, against, long_reference, reference_shot
-from figures.computing.scenes import BUNNY, MATERIALS, bunny_scene, prepare
+from figures.computing.scans import BUNNY, MATERIALS, bunny_scene, prepare
 from figures.computing.timed import COMPILING, gathered_anew
 from figures.drawing.image_files import image_files, label
 from figures.parts.part import Part, Result, Task

@@ -10,7 +10,7 @@ from figures.computing.contenders import MODELS, OF_OBJECTS, VOLUMES, WALK, cont
 from figures.computing.images import FLIP, RELATIVE_MSE, Shot, check_denoiser, denoised, guides
 from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training_of, weight_files, with_weights
 from figures.computing.references import NOTE, against, long_reference, reference_shot
-from figures.computing.scenes import BUNNY, prepare
+from figures.computing.scans import BUNNY, prepare
 from figures.computing.timed import TimedRender, alternating, pass_size
 from figures.drawing.image_files import image_files, label
 from figures.parts.part import Part, Result, Row, Task

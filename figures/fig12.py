@@ -12,7 +12,7 @@ import numpy as np
 from figures.computing.images import FLIP, Shot, compared, stops_of
 from figures.computing.learnt import shape_of
 from figures.computing.references import reference_image
-from figures.computing.scenes import BUNNY, bunny_scene, prepare
+from figures.computing.scans import BUNNY, bunny_scene, prepare
 from figures.drawing.image_files import image_files
 from figures.parts.part import Params, Part, Result, Task
 from halfspace_sss.neural.store import weights_in

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from halfspace_sss import materials, measure, neural
     from halfspace_sss.comparison.reflectance_curves import curves
     from halfspace_sss.interface.model import BSSRDF
-    from halfspace_sss.maps.store import make_maps
+    from halfspace_sss.maps.map_store import make_maps
     from halfspace_sss.physics.layers import Layers
     from halfspace_sss.physics.medium import Medium
     from halfspace_sss.registry import bssrdf, models, register_model
@@ -61,7 +61,7 @@ __getattr__, __dir__ = lazy_names(
         "Medium": "physics.medium",
         "bssrdf": "registry",
         "curves": "comparison.reflectance_curves",
-        "make_maps": "maps.store",
+        "make_maps": "maps.map_store",
         "materials": "",
         "measure": "",
         "models": "registry",

@@ -14,7 +14,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any
 
 COMMANDS, MODELS = "halfspace_sss.commands", "halfspace_sss.models"
 LEARNERS, TRANSPORTS = "halfspace_sss.learners", "halfspace_sss.transports"
@@ -42,7 +41,7 @@ def _is_own(entry: EntryPoint) -> bool:
     return entry.dist is not None and entry.dist.name == OWN
 
 
-def loaded(entry: EntryPoint) -> Any:
+def loaded(entry: EntryPoint) -> object:
     """What an entry point names; None if it does not load, with a warning."""
     try:
         return entry.load()
@@ -51,7 +50,7 @@ def loaded(entry: EntryPoint) -> Any:
         return None
 
 
-def offered(group: str, own: bool = False) -> Iterator[tuple[str, Any]]:
+def offered(group: str, own: bool = False) -> Iterator[tuple[str, object]]:
     """Name and object of every entry point of a group that loads, of packages of others or of this project."""
     for entry in entry_points(group=group):
         if _is_own(entry) == own and (result := loaded(entry)) is not None:

@@ -7,8 +7,7 @@ a whole, or left out with a warning.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterable, Mapping
 
 from halfspace_sss.checks import did_you_mean
 from halfspace_sss.extensions import FAILURES, MODELS, offered, warn_left_out
@@ -73,7 +72,7 @@ def model_class(name: str) -> type[BSSRDF]:
     return known[name]
 
 
-def check_model_class(cls: Any, base: type) -> None:
+def check_model_class(cls: object, base: type) -> None:
     """ValueError if it is no class of a model, or has no usable name or orders."""
     if not (isinstance(cls, type) and issubclass(cls, base)):
         raise ValueError(f"a model must be a subclass of {base.__name__}, got {cls!r}")
@@ -95,7 +94,7 @@ def listed_models(base: type) -> dict[str, type]:
     return results
 
 
-def _new_models(classes: Any, base: type, known: Mapping[str, type]) -> dict[str, type]:
+def _new_models(classes: Iterable[type], base: type, known: Mapping[str, type]) -> dict[str, type]:
     new: dict[str, type] = {}
     for cls in classes:
         check_model_class(cls, base)

@@ -26,7 +26,7 @@ import typer.testing
 
 import halfspace_sss
 from halfspace_sss import backend
-from halfspace_sss.materials import registry
+from halfspace_sss.materials import catalogue as registry
 from halfspace_sss.neural import material_model, paper_model, store
 from halfspace_sss.neural.features import N_FEATURES
 from halfspace_sss.neural.network import layer_shapes

@@ -22,7 +22,7 @@ from halfspace_sss import Medium, executors, make_maps
 from halfspace_sss.backend import BackendError, cores
 from halfspace_sss.executors import completed
 from halfspace_sss.maps.grid import MapGrid
-from halfspace_sss.maps.store import load_maps
+from halfspace_sss.maps.map_store import load_maps
 
 MEDIA = {"even": Medium.from_albedo(0.75, 1.0, 0.0, 1.3), "forward": Medium.from_albedo(0.99, 1.0, 0.8, 1.5)}
 HOW = {"grid": MapGrid(2, 16, 6, 4), "target_error": None, "n_paths": 2048}

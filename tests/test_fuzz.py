@@ -24,12 +24,12 @@ from typer.testing import CliRunner
 import halfspace_sss
 from figures import app as cli
 from halfspace_sss import Medium, materials
-from halfspace_sss.maps.store import load_maps, make_maps
+from halfspace_sss.maps.map_store import load_maps, make_maps
 
 CASES = int(os.environ.get("HALFSPACE_SSS_FUZZ", "0"))
 HOW = {"deadline": None, "derandomize": CASES == 0, "database": None, "suppress_health_check": list(HealthCheck)}
 COMPUTES = [  # what is replaced: the properties are of what comes before the computation
-    "halfspace_sss.comparison.reflectance_curves.trace_curve", "halfspace_sss.maps.store.trace_unit",
+    "halfspace_sss.comparison.reflectance_curves.trace_curve", "halfspace_sss.maps.map_store.trace_unit",
     "halfspace_sss.comparison.model_errors.references", "halfspace_sss.neural.train",
     "halfspace_sss.neural.training.train_universal.train_universal",
     "halfspace_sss.comparison.truths.validate",

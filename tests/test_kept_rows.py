@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from figures import app as cli
 from halfspace_sss.comparison import model_truths
-from halfspace_sss.kept_rows import KeptRows
+from halfspace_sss.provenance import KeptRows
 
 
 def test_rows_of_the_same_run_are_found_again_and_others_dropped(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from figures import app as cli
 from halfspace_sss import Medium
 from halfspace_sss.locks import one_writer
 from halfspace_sss.maps.grid import MapGrid
-from halfspace_sss.maps.store import load_maps, make_maps
+from halfspace_sss.maps.map_store import load_maps, make_maps
 
 HOLD = """
 import sys

@@ -11,7 +11,7 @@ import pytest
 
 from halfspace_sss import Medium
 from halfspace_sss.maps.grid import MapGrid
-from halfspace_sss.maps.store import load_maps, make_maps
+from halfspace_sss.maps.map_store import load_maps, make_maps
 
 MEDIA = {"m": Medium([1.0, 2.0], 0.1)}
 HOW = {"grid": MapGrid(2, 16, 4, 4), "target_error": None, "n_paths": 1024}

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from halfspace_sss import Medium
-from halfspace_sss.maps import store
+from halfspace_sss.maps import map_store as store
 from halfspace_sss.maps.grid import MapGrid
-from halfspace_sss.maps.store import load_maps, make_maps
+from halfspace_sss.maps.map_store import load_maps, make_maps
 from halfspace_sss.neural.store import find_weights, load_weights, save_weights, weights_in, weights_name
 from halfspace_sss.provenance import check_folder, path_of
 

@@ -24,7 +24,7 @@ import pytest
 import halfspace_sss
 from halfspace_sss import Medium, executors
 from halfspace_sss.executors import completed
-from halfspace_sss.maps.store import load_maps
+from halfspace_sss.maps.map_store import load_maps
 
 SHARE = float(os.environ.get("HALFSPACE_SSS_SOAK", "0"))
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(SHARE <= 0, reason="HALFSPACE_SSS_SOAK is not set")]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from figures.computing.learnt import SHAPES, object_parts
-from figures.computing.scenes import BUNNY, bunny_scene, prepare
+from figures.computing.scans import BUNNY, bunny_scene, prepare
 from figures.parts.part import Params, Part, Result, Task
 from halfspace_sss.comparison.style import TEXT, paper, saved
 from halfspace_sss.provenance import check_folder

@@ -16,11 +16,10 @@ from figures.computing.learnt import (
     train_modelled,
     training_of,
 )
-from figures.computing.modelled import VIEWS, View, foot, scene
 from figures.computing.references import NOTE, against, reference_shot
-from figures.computing.scenes import environment_file, prepare
+from figures.computing.scans import environment_file, prepare
 from figures.drawing.image_files import image_files
-from figures.fig01 import LIGHT, RESOLUTION, SIZES, TRUTH, shown
+from figures.fig01 import LIGHT, RESOLUTION, SIZES, TRUTH, VIEWS, View, foot, scene, shown
 from figures.fig01 import SPP as OURS_SPP
 from figures.modelling.objects import TISSUES
 from figures.parts.part import Part, Result, SceneDict, Task

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from figures.computing.learnt import shape_of
-from figures.computing.scenes import BUNNY, prepare
+from figures.computing.scans import BUNNY, prepare
 from figures.parts.part import Params, Part, Result, Task
 from halfspace_sss.comparison.style import COLUMN, paper, saved
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, trained, training_of, weight_files, with_weights
 from figures.computing.references import NOTE
-from figures.computing.scenes import prepare
+from figures.computing.scans import prepare
 from figures.computing.things import Staging, lit_scene, shown, thing_parts, walked
 from figures.drawing.image_files import against_walks, image_files, rows_of
 from figures.modelling.head import make_head, write_painted

@@ -11,7 +11,7 @@ import numpy as np
 
 from figures.computing import contenders
 from figures.computing.learnt import weight_files
-from figures.computing.scenes import prepare
+from figures.computing.scans import prepare
 from figures.parts.part import Params, Part, Result, SceneDict, Task
 from halfspace_sss.comparison.style import COLUMN, look, paper, saved
 from halfspace_sss.physics.medium import Medium

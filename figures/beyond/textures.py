@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from figures.computing.references import NOTE
-from figures.computing.scenes import BUNNY, MM_PER_UNIT
+from figures.computing.scans import BUNNY, MM_PER_UNIT
 from figures.computing.things import Staging, lit_scene, shown, thing_parts, walked
 from figures.drawing.image_files import against_walks, image_files, rows_of
 from figures.parts.part import Part, Result, SceneDict, Task

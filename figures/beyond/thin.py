@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from figures.computing.learnt import weight_files
 from figures.computing.references import NOTE
-from figures.computing.scenes import DRAGON, SCANS
+from figures.computing.scans import DRAGON, SCANS
 from figures.computing.things import Staging, lit_scene, shown, thing_parts, walked
 from figures.drawing.image_files import against_walks, image_files, rows_of
 from figures.modelling.leaf import LEAVES

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from figures.computing.scenes import long_render, prepare, scan_scene
+from figures.computing.scans import long_render, prepare, scan_scene
 from figures.parts.part import SceneDict, Task
 from full_geometry.transport.models import model_names
 from halfspace_sss import bssrdf
@@ -40,7 +40,7 @@ def contender(
 
     Args:
         method, bare: as in `ready`.
-        material, size, lights, sampler, scan: as in `figures.computing.scenes.scan_scene`.
+        material, size, lights, sampler, scan: as in `figures.computing.scans.scan_scene`.
 
     Raises:
         ValueError: no such method, material or lights.

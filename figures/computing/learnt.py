@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from figures.computing.scenes import BUNNY, MM_PER_UNIT, SCANS, prepare, scan_scene
+from figures.computing.scans import BUNNY, MM_PER_UNIT, SCANS, prepare, scan_scene
 from figures.modelling.candle import make_candle
 from figures.modelling.objects import candle_parts, learnable_parts, make_varying, tissue
 from figures.parts.part import Part, Result, SceneDict, Task

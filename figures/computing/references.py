@@ -18,7 +18,7 @@ from figures.computing.images import (
     noise_of,
     stops_of,
 )
-from figures.computing.scenes import long_render, prepare
+from figures.computing.scans import long_render, prepare
 from figures.parts.part import Result, Task
 
 if TYPE_CHECKING:

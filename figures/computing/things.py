@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from figures.computing.references import reference_image
-from figures.computing.scenes import prepare
+from figures.computing.scans import prepare
 from figures.parts.part import Params, Part, SceneDict, Task
 
 

@@ -112,7 +112,7 @@ class Part:
         return f"{name}, {self.like}" if self.like else name
 
 
-def canonical(value: Any, what: str) -> str:
+def canonical(value: object, what: str) -> str:
     """The one JSON text of a value; ValueError names `what` if it has none, as NaN has none."""
     try:
         return json.dumps(value, sort_keys=True, allow_nan=False, separators=(",", ":"))

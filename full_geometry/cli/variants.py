@@ -11,7 +11,7 @@ import typer
 
 from halfspace_sss.backend import BackendError, prepare_llvm
 from halfspace_sss.cli import shared
-from halfspace_sss.cli.interrupts import interrupts
+from halfspace_sss.interrupts import interrupts
 
 if TYPE_CHECKING:
     from full_geometry.inverse.comparing import MaterialFit

@@ -18,8 +18,8 @@ from full_geometry.transport.features import Terms, entering, n_pair, reverse
 from full_geometry.transport.one_object import BOUND
 from full_geometry.transport.patches import Patches
 from halfspace_sss.checks import check_choice, check_count, check_interval
-from halfspace_sss.neural.training import checkpoint
 from halfspace_sss.neural.training.fit import Descent, cosine, torch_threads, warm_up
+from halfspace_sss.neural.training.unfinished import gone_on_with, write_checkpoint
 from halfspace_sss.registry import models
 
 # ---- Where networks are fitted: beside the walks that are their data -------------------------------
@@ -424,7 +424,7 @@ class ObjectFit:
         """Write a checkpoint after `done` chunks."""
         rows = torch.tensor([list(row) for row in history], dtype=torch.float64).reshape(-1, 3)
         counters = torch.tensor([self.step, done], dtype=torch.float64)
-        checkpoint.write(path, self._tensors(), counters=counters, history=rows)
+        write_checkpoint(path, self._tensors(), counters=counters, history=rows)
 
     def load(self, path: Path) -> tuple[int, list]:
         """Go on from a checkpoint; returns its chunks and history.
@@ -432,7 +432,7 @@ class ObjectFit:
         Raises:
             ValueError: it is damaged or of another recipe.
         """
-        with checkpoint.gone_on_with(path, self._tensors()) as stored:
+        with gone_on_with(path, self._tensors()) as stored:
             self.descent.steps, done = (int(v) for v in stored["counters"].tolist())
             history = [(int(k), error, spread) for k, error, spread in stored["history"].tolist()]
         return done, history

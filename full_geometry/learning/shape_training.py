@@ -37,9 +37,8 @@ from full_geometry.transport.descriptors import (
 from full_geometry.transport.exit_pairs import EntryProposals, trace_exits
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.neural.store import save_weights, to_json
-from halfspace_sss.neural.training import checkpoint
 from halfspace_sss.neural.training.fit import Descent, cosine, warm_up
-from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
+from halfspace_sss.neural.training.unfinished import CHECKPOINT, claim, gone_on_with, write_checkpoint
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import check_folder, provenance, write_atomically
@@ -184,7 +183,7 @@ class ShapeFit:
     def save(self, path: Path, done: int) -> None:
         """Write a checkpoint after `done` chunks."""
         counters = torch.tensor([self.step, done], dtype=torch.float64)
-        checkpoint.write(path, self.descent.tensors(), counters=counters)
+        write_checkpoint(path, self.descent.tensors(), counters=counters)
 
     def load(self, path: Path) -> int:
         """Go on from a checkpoint; returns its chunks.
@@ -192,7 +191,7 @@ class ShapeFit:
         Raises:
             ValueError: it is damaged or of another recipe.
         """
-        with checkpoint.gone_on_with(path, self.descent.tensors()) as stored:
+        with gone_on_with(path, self.descent.tensors()) as stored:
             self.descent.steps, done = (int(v) for v in stored["counters"].tolist())
         return done
 

@@ -61,7 +61,7 @@ from full_geometry.surface.textured import TexturedMedium, constant_texture, tex
 from full_geometry.surface.varying import VaryingMedium, constant_value, mean_of_grids, varying_medium
 from halfspace_sss import materials
 from halfspace_sss.checks import check_choice
-from halfspace_sss.materials.registry import one_channel
+from halfspace_sss.materials.catalogue import one_channel
 from halfspace_sss.materials.spectra import SpectralMedium
 from halfspace_sss.physics.fresnel import F_t, mu_internal
 from halfspace_sss.physics.medium import Medium

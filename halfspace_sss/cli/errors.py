@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -92,8 +92,7 @@ def errors_materials(
 def errors_truths(model: shared.Models = None, out: shared.OutFolder = Path("errors")) -> None:
     """Compare reflectances of models with published and exact values; an interrupted run goes on."""
     from halfspace_sss.comparison.model_truths import reflectance_truths, truth_summary, truths_cost
-    from halfspace_sss.kept_rows import KeptRows
-    from halfspace_sss.provenance import check_folder, write_atomically
+    from halfspace_sss.provenance import KeptRows, check_folder, write_atomically
 
     check_models(model)
     check_folder(out)
@@ -160,7 +159,7 @@ def _check_accepted(names: Sequence[str], media: list[Medium]) -> None:
 
 
 def write_errors(
-    out: Path, found: pandas.DataFrame, summary: pandas.DataFrame, definition: str, how: dict[str, Any]
+    out: Path, found: pandas.DataFrame, summary: pandas.DataFrame, definition: str, how: Mapping[str, object]
 ) -> list[Path]:
     """Write errors.csv and errors.json, with what an error is and how it was measured; the paths."""
     from halfspace_sss.provenance import provenance, write_together
@@ -197,14 +196,14 @@ def _table(frame: pandas.DataFrame, title: str) -> Table:
     return shared.table([str(name) for name in columns], rows, title=title, left=left)
 
 
-def told_error(row: dict[str, Any]) -> str:
+def told_error(row: Mapping[str, float]) -> str:
     """An error with its standard error, or what it is below."""
     from halfspace_sss.noise_free import NoiseFree
 
     return NoiseFree(*(row[name] for name in SQUARE)).told()
 
 
-def _cell(value: Any) -> str:
+def _cell(value: float | str) -> str:
     if isinstance(value, str):
         return value
     if isinstance(value, int):

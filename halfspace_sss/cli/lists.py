@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -13,14 +13,16 @@ from halfspace_sss.cli.shared import AsJson, OneMaterial, say, table
 if TYPE_CHECKING:
     import pandas
 
+    from halfspace_sss.provenance import JsonDict
+
 NUMBERS = ("sigma_s", "sigma_a", "sigma_t", "albedo", "g", "eta", "sigma_s_prime", "albedo_prime")
 
 
-def _say_json(value: Any) -> None:
+def _say_json(value: JsonDict | list[JsonDict]) -> None:
     say(json.dumps(value, indent=1, ensure_ascii=False))
 
 
-def _records(frame: pandas.DataFrame) -> list[dict[str, Any]]:
+def _records(frame: pandas.DataFrame) -> list[JsonDict]:
     return json.loads(frame.to_json(orient="records"))
 
 

@@ -65,7 +65,7 @@ def maps(
     ] = Path("maps"),
 ) -> None:
     """Trace training maps into Zarr stores; an interrupted run goes on when it is started again."""
-    from halfspace_sss.maps.store import make_maps
+    from halfspace_sss.maps.map_store import make_maps
     from halfspace_sss.provenance import check_folder
 
     media = stated.media(material or [], channel)
@@ -111,7 +111,7 @@ def _grid(text: str) -> MapGrid:
 
 def _table(stores: dict[str, Path]) -> Table:
     """What each store holds; loading it checks that it is whole."""
-    from halfspace_sss.maps.store import load_maps
+    from halfspace_sss.maps.map_store import load_maps
 
     rows = []
     for name, path in stores.items():

@@ -14,13 +14,13 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from typer.core import TyperGroup
 
 from halfspace_sss.backend import BackendError
-from halfspace_sss.cli.interrupts import interrupts
+from halfspace_sss.interrupts import interrupts
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -48,14 +48,14 @@ def tell_interrupt(error: BaseException) -> typer.Exit:
     return _end(f"interrupted; {detail or 'files that were being written are whole or absent'}", interrupts.exit_code)
 
 
-def _show_warning(message: Any, *_: Any) -> None:
+def _show_warning(message: Warning | str, *_: object) -> None:
     typer.echo(f"warning: {' '.join(str(message).split())}", err=True)
 
 
 class Commands(TyperGroup):
     """The commands; what they and the library refuse, and interrupts, end them in a line."""
 
-    def invoke(self, ctx: Any) -> Any:
+    def invoke(self, ctx: typer.Context) -> object:
         with interrupts, warnings.catch_warnings():
             warnings.showwarning = _show_warning
             try:
@@ -65,7 +65,7 @@ class Commands(TyperGroup):
                     raise
                 raise tell_interrupt(error) from None
 
-    def _refuse_in_a_line(self, ctx: Any) -> Any:
+    def _refuse_in_a_line(self, ctx: typer.Context) -> object:
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt as error:
@@ -110,7 +110,7 @@ def add(app: typer.Typer, name: str, function: Callable) -> None:
         else:
             parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
 
-    def run(quiet: bool, **options: Any) -> Any:
+    def run(quiet: bool, **options: object) -> object:
         made = {
             key: record(**{field.name: options.pop(field.name) for field in dataclasses.fields(record)})
             for key, record in records.items()
@@ -371,7 +371,7 @@ class MediumOptions:
     def media(self, materials: Sequence[str], channels: str | None) -> dict[str, Medium]:
         """Media by title: of materials, of their channels, as in "R,B", those stated, or that of Fig. 10."""
         from halfspace_sss.materials import load
-        from halfspace_sss.materials.registry import one_channel
+        from halfspace_sss.materials.catalogue import one_channel
 
         stated = self.stated(materials)
         if channels is not None and not materials:

@@ -5,15 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
 import typer
 
 from halfspace_sss.cli import shared
 
 if TYPE_CHECKING:
+    from halfspace_sss.neural.training.train_material import MaterialRecipe, TrainedChannel
+    from halfspace_sss.neural.training.train_universal import UniversalRecipe
     from halfspace_sss.physics.medium import Medium
 
+Recipe = TypeVar("Recipe", "MaterialRecipe", "UniversalRecipe")
 Steps = Annotated[
     int | None, typer.Option(help="Steps of the optimiser.", parser=shared.whole, show_default="from the recipe")
 ]
@@ -73,7 +76,7 @@ def train_material(
 
     media = stated.media(material or [], channel)
     recipe = _of_steps(FAST if wanted.fast else STANDARD, wanted.steps)
-    rows: dict[str, list[Any]] = {}
+    rows: dict[str, list[TrainedChannel]] = {}
     with places.executor() as executor, shared.Bar("training") as bar:
         results = results.elsewhere() if executor else results
         how = {"model": wanted.model, "recipe": recipe, "backend": wanted.backend, "seed": results.seed}
@@ -103,7 +106,7 @@ def train_universal(
     shared.say(f"written: {path}")
 
 
-def _of_steps(recipe: Any, steps: int | None) -> Any:
+def _of_steps(recipe: Recipe, steps: int | None) -> Recipe:
     """A recipe with another number of steps, if one is given."""
     from halfspace_sss.checks import check_count
 
@@ -113,7 +116,9 @@ def _of_steps(recipe: Any, steps: int | None) -> Any:
     return replace(recipe, how=replace(recipe.how, steps=steps))
 
 
-def _train(name: str, medium: Medium, how: dict[str, Any], work: Path | None, bar: shared.Bar | None) -> list[Any]:
+def _train(
+    name: str, medium: Medium, how: dict[str, object], work: Path | None, bar: shared.Bar | None
+) -> list[TrainedChannel]:
     """Networks of the channels of a medium; on a worker without a bar."""
     from halfspace_sss import neural
 
@@ -123,7 +128,7 @@ def _train(name: str, medium: Medium, how: dict[str, Any], work: Path | None, ba
     return neural.train(medium, **how, work=work / name if work else None, progress=show if bar else None)
 
 
-def _report(rows: list[tuple[str, Any]]) -> None:
+def _report(rows: list[tuple[str, TrainedChannel]]) -> None:
     cells = []
     for name, r in rows:
         ratios = (f"{float(getattr(r.medium, key)):.4g}" for key in ("albedo", "g", "eta"))

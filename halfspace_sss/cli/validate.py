@@ -7,7 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -15,6 +15,7 @@ from halfspace_sss.cli.shared import Bar, Seed, csv_of, say, table
 
 if TYPE_CHECKING:
     from halfspace_sss.comparison.truths import Comparison, Truth, Validation
+    from halfspace_sss.provenance import JsonDict
 
 KINDS = ("published", "thirdparty", "exact")
 
@@ -37,7 +38,7 @@ def row_filter(text: str | None) -> Callable[[Truth], bool] | None:
     return lambda truth: bool(wanted & {truth.id, truth.measure, truth.kind})
 
 
-def summary(comparisons: list[Comparison]) -> list[dict[str, Any]]:
+def summary(comparisons: list[Comparison]) -> list[JsonDict]:
     """One record per quantity: rows, largest and rms z, largest standard error relative to the traced value.
 
     Reflectances of albedo below 0.5, of which larger relative errors are asked, are apart.
@@ -55,7 +56,7 @@ def summary(comparisons: list[Comparison]) -> list[dict[str, Any]]:
     return results
 
 
-def _record(c: Comparison) -> dict[str, Any]:
+def _record(c: Comparison) -> JsonDict:
     """A row of the CSV and JSON files."""
     t, m = c.truth, c.truth.medium
     mu_o, phi = t.direction or (None, None)
@@ -89,7 +90,7 @@ def write_results(result: Validation, folder: Path) -> None:
     write_together({folder / "validate.csv": csv_of(pandas.DataFrame(records)), folder / "validate.json": about})
 
 
-def _strict(value: Any) -> Any:
+def _strict(value: object) -> object:
     """The value with None in place of infinities and NaN, which JSON does not know."""
     if isinstance(value, dict):
         return {key: _strict(v) for key, v in value.items()}

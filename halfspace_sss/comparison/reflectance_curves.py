@@ -15,7 +15,7 @@ from halfspace_sss.comparison.curve_set import TRACED, Curve, CurveSet
 from halfspace_sss.comparison.model_truths import sampled_reflectance
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.materials import Material
-from halfspace_sss.materials.registry import one_channel
+from halfspace_sss.materials.catalogue import one_channel
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.fresnel import mu_internal
 from halfspace_sss.physics.medium import Medium

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING
 
-from halfspace_sss.arrays import is_torch
+from halfspace_sss.arrays import Library, Real, is_torch
 from halfspace_sss.lazy import once
+
+if TYPE_CHECKING:
+    import torch
+    from torch.autograd.function import FunctionCtx
 
 BLOCK_BYTES = 1 << 27  # that torch keeps of one block
 PROBE = 64  # queries
 
 
-def recorded_in_blocks(lib: Any, f: Callable[..., Any], args: tuple) -> Any:
+def recorded_in_blocks(lib: Library, f: Callable[..., Real], args: tuple) -> Real:
     """f(*args), a function of each query alone, so that torch keeps the arguments for its derivatives and no more.
 
     torch keeps what every operation was given, tens of kB a query where a model integrates. Queries that would exceed
@@ -33,7 +38,7 @@ def recorded_in_blocks(lib: Any, f: Callable[..., Any], args: tuple) -> Any:
     return values.reshape(*shape, *values.shape[1:])
 
 
-def _recorded(lib: Any, args: tuple) -> bool:
+def _recorded(lib: Library, args: tuple) -> bool:
     """Whether torch records derivatives for going backwards, and of more queries than the probes take."""
     if not is_torch(lib) or not lib.torch.is_grad_enabled() or args[0].numel() <= 2 * PROBE:
         return False
@@ -43,13 +48,13 @@ def _recorded(lib: Any, args: tuple) -> bool:
     return any(a.requires_grad for a in args)
 
 
-def _kept_bytes(torch: Any, f: Callable[..., Any], flat: list) -> float:
+def _kept_bytes(torch: ModuleType, f: Callable[..., Real], flat: list) -> float:
     """What the graph of f keeps of one query: by how much that of two probes differs from that of one."""
     sizes = []
     for n in (PROBE, 2 * PROBE):
         kept: dict[int, int] = {}
 
-        def keep(tensor: Any, kept: dict = kept) -> Any:
+        def keep(tensor: torch.Tensor, kept: dict = kept) -> torch.Tensor:
             storage = tensor.untyped_storage()
             kept[storage.data_ptr()] = storage.nbytes()
             return tensor
@@ -63,20 +68,20 @@ def _kept_bytes(torch: Any, f: Callable[..., Any], flat: list) -> float:
 
 
 @once
-def _block_class() -> Any:
+def _block_class() -> type:
     import torch
 
     class Block(torch.autograd.Function):
         """f(*args), recorded when its derivatives are asked for; those of higher order are recorded whole."""
 
         @staticmethod
-        def forward(ctx: Any, f: Callable[..., Any], *args: Any) -> Any:
+        def forward(ctx: FunctionCtx, f: Callable[..., Real], *args: torch.Tensor) -> torch.Tensor:
             ctx.f = f
             ctx.save_for_backward(*args)
             return f(*args)
 
         @staticmethod
-        def backward(ctx: Any, outer: Any) -> tuple:
+        def backward(ctx: FunctionCtx, outer: torch.Tensor) -> tuple:
             again, needed = torch.is_grad_enabled(), ctx.needs_input_grad[1:]
             args = [a if again else a.detach().requires_grad_(n) for a, n in zip(ctx.saved_tensors, needed)]
             inputs = [a for a, n in zip(args, needed) if n]

@@ -5,12 +5,12 @@ from __future__ import annotations
 import abc
 import functools
 import math
-from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from halfspace_sss.arrays import asks_nothing, broadcast_query
+from halfspace_sss.arrays import Library, Real, asks_nothing, broadcast_query
 from halfspace_sss.checks import check_query
 from halfspace_sss.interface.gradient_blocks import recorded_in_blocks
 from halfspace_sss.interface.query import Query
@@ -24,17 +24,17 @@ FARTHEST = 0.44  # of the exponent range: in mean free paths, where r² is finit
 class PositionSample(NamedTuple):
     """Where light enters: distance r (mm) and azimuth phi of x_i about x_o from w_o, density pdf (1/mm²)."""
 
-    r: Any
-    phi: Any
-    pdf: Any
+    r: Real
+    phi: Real
+    pdf: Real
 
 
 class DirectionSample(NamedTuple):
     """Where light comes from: mu_i, phi_i as in `BSSRDF.eval`, density pdf over outside directions (1/sr)."""
 
-    mu_i: Any
-    phi_i: Any
-    pdf: Any
+    mu_i: Real
+    phi_i: Real
+    pdf: Real
 
 
 class BSSRDF(abc.ABC):
@@ -61,7 +61,7 @@ class BSSRDF(abc.ABC):
     fast_in: str = "drjit"
     checksums: tuple[str, ...] = ()
 
-    def __new__(cls, *made_of: Any, **options: Any) -> BSSRDF:
+    def __new__(cls, *made_of: object, **options: object) -> BSSRDF:
         model = super().__new__(cls)
         options.pop("medium", None)
         model._options = (made_of[1:], options)
@@ -76,14 +76,14 @@ class BSSRDF(abc.ABC):
         return f"<{self.name}, orders {self.orders}: {self.medium}>"
 
     @abc.abstractmethod
-    def G(self, q: Query) -> Any:
+    def G(self, q: Query) -> Real:
         """S / (T_12 T_21) in 1/(mfp² sr) for a query in mean free paths."""
 
-    def G_unclamped(self, q: Query) -> Any:
+    def G_unclamped(self, q: Query) -> Real:
         """`G` before negative values are clamped; a model that clamps gives it."""
         return self.G(q)
 
-    def eval(self, r: Any, mu_i: Any, phi_i: Any, mu_o: Any, phi_o: Any) -> Any:
+    def eval(self, r: Real, mu_i: Real, phi_i: Real, mu_o: Real, phi_o: Real) -> Real:
         """S in 1/(mm² sr).
 
         Args:
@@ -100,11 +100,11 @@ class BSSRDF(abc.ABC):
         """
         return self._S(self.G, r, mu_i, phi_i, mu_o, phi_o)
 
-    def eval_unclamped(self, r: Any, mu_i: Any, phi_i: Any, mu_o: Any, phi_o: Any) -> Any:
+    def eval_unclamped(self, r: Real, mu_i: Real, phi_i: Real, mu_o: Real, phi_o: Real) -> Real:
         """`eval` without the clamp that keeps a model from turning negative; the same where it has none."""
         return self._S(self.G_unclamped, r, mu_i, phi_i, mu_o, phi_o)
 
-    def _S(self, G_of: Callable[[Query], Any], *query: Any) -> Any:
+    def _S(self, G_of: Callable[[Query], Real], *query: Real) -> Real:
         """sigma_t² T_12 T_21 G_of(query)."""
         lib, args = broadcast_query(*query, names=("r", "mu_i", "phi_i", "mu_o", "phi_o"))
         if asks_nothing(lib, args):
@@ -113,7 +113,7 @@ class BSSRDF(abc.ABC):
         S = recorded_in_blocks(lib, functools.partial(self._S_of_checked, lib, G_of), args)
         return S[()] if isinstance(S, np.ndarray) else S
 
-    def _S_of_checked(self, lib: Any, G_of: Callable[[Query], Any], *args: Any) -> Any:
+    def _S_of_checked(self, lib: Library, G_of: Callable[[Query], Real], *args: Real) -> Real:
         if self.medium.n_channels is not None:
             lib.constant(self.medium.sigma_t, args[0])
             args = tuple(a[..., None] for a in args)
@@ -136,7 +136,7 @@ class BSSRDF(abc.ABC):
         positional, named = self._options
         return type(self)(medium, *positional, **named)
 
-    def _per_channel(self, lib: Any, x: Any, answer: Any) -> Any:
+    def _per_channel(self, lib: Library, x: Real, answer: Callable[[RadialSampler, float], Real]) -> Real:
         """`answer(sampler, sigma_t)` for each channel, stacked last."""
         if self.medium.n_channels is None:
             return answer(self._radial_samplers[0], self.medium.sigma_t)
@@ -144,7 +144,7 @@ class BSSRDF(abc.ABC):
         parts = [answer(s, float(t)) for s, t in zip(self._radial_samplers, self.medium.sigma_t)]
         return lib.stack(parts)
 
-    def sample_position(self, mu_o: Any, u: Any) -> PositionSample:
+    def sample_position(self, mu_o: Real, u: Real | Sequence[Real]) -> PositionSample:
         """Sample where light enters for an exit direction, from the model's own radial profile.
 
         Args:
@@ -164,7 +164,7 @@ class BSSRDF(abc.ABC):
         pdf = self._pdf_own_channel(lib, r)
         return PositionSample(r, phi[..., None] + 0 * r if self.medium.n_channels else phi, pdf)
 
-    def _pdf_own_channel(self, lib: Any, r: Any) -> Any:
+    def _pdf_own_channel(self, lib: Library, r: Real) -> Real:
         """Density of `sample_position` for r that already carries the channel axis, 1/mm²."""
         if self.medium.n_channels is None:
             sigma_t = self.medium.sigma_t
@@ -175,14 +175,14 @@ class BSSRDF(abc.ABC):
         ]
         return lib.stack(parts)
 
-    def pdf_position(self, r: Any, phi: Any, mu_o: Any) -> Any:
+    def pdf_position(self, r: Real, phi: Real, mu_o: Real) -> Real:
         """Density of `sample_position` in 1/mm² at distance r (mm) and azimuth phi; arguments broadcast."""
         lib, (r, phi, mu_o) = broadcast_query(r, phi, mu_o)
         if asks_nothing(lib, (r, phi, mu_o)):
             return type(r)()
         return self._per_channel(lib, r, lambda sampler, sigma_t: sigma_t**2 * sampler.pdf(lib, sigma_t * r))
 
-    def sample_direction(self, r: Any, mu_o: Any, phi_o: Any, u: Any) -> DirectionSample:
+    def sample_direction(self, r: Real, mu_o: Real, phi_o: Real, u: Real | Sequence[Real]) -> DirectionSample:
         """Sample where light comes from, given the position: by the cosine over the directions that refract.
 
         pdf = mu_i / pi, or mu_i / (pi eta²) within the cone 1 - mu_i² < eta² for eta < 1.
@@ -200,7 +200,7 @@ class BSSRDF(abc.ABC):
         phi_i = 2 * math.pi * u_2 - math.pi
         return DirectionSample(mu_i, phi_i, mu_i / (math.pi * cone))
 
-    def pdf_direction(self, mu_i: Any, phi_i: Any, r: Any, mu_o: Any, phi_o: Any) -> Any:
+    def pdf_direction(self, mu_i: Real, phi_i: Real, r: Real, mu_o: Real, phi_o: Real) -> Real:
         """Density of `sample_direction` over outside directions, 1/sr."""
         lib, (mu_i, phi_i, r, mu_o, phi_o) = broadcast_query(mu_i, phi_i, r, mu_o, phi_o)
         if asks_nothing(lib, (mu_i, phi_i, r, mu_o, phi_o)):
@@ -210,7 +210,7 @@ class BSSRDF(abc.ABC):
         return lib.where(inside, mu_i / (math.pi * cone), 0 * mu_i)
 
 
-def _split(u: Any) -> tuple[Any, Any]:
+def _split(u: Real | Sequence[Real]) -> tuple[Real, Real]:
     if isinstance(u, (tuple, list)):
         if len(u) != 2:
             raise ValueError(f"u must be a pair of arrays, got {len(u)} of them")
@@ -239,7 +239,7 @@ class Separable(BSSRDF):
     reciprocal = True
 
     @abc.abstractmethod
-    def R_d(self, q: Query) -> Any:
+    def R_d(self, q: Query) -> Real:
         """Radial exitance profile in 1/mfp², for q.r in mean free paths."""
 
     @property
@@ -247,5 +247,5 @@ class Separable(BSSRDF):
     def N(self) -> float:
         """Exit normaliser: 1 as in Jensen et al. 2001, or `exit_normaliser(eta)`, which conserves the flux."""
 
-    def G(self, q: Query) -> Any:
+    def G(self, q: Query) -> Real:
         return self.R_d(q) / q.constant(math.pi * self.N)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import Any
 
+from halfspace_sss.arrays import Library, Real
 from halfspace_sss.physics.fresnel import mu_internal, sine
 
 
@@ -17,42 +17,42 @@ class Query:
     w_12 = (-sin_i cos phi_i, -sin_i sin phi_i, -mu_i_in) and w_21 = (sin_o cos phi_o, sin_o sin phi_o, mu_o_in).
     """
 
-    lib: Any
-    r: Any
-    mu_i: Any
-    phi_i: Any
-    mu_o: Any
-    phi_o: Any
+    lib: Library
+    r: Real
+    mu_i: Real
+    phi_i: Real
+    mu_o: Real
+    phi_o: Real
     eta: float
-    r_mm: Any = None
-    sigma_t: Any = None  # r = sigma_t r_mm, kept so that `in_float64` does not inherit the rounding of r
+    r_mm: Real | None = None
+    sigma_t: Real | None = None  # r = sigma_t r_mm, kept so that `in_float64` does not inherit the rounding of r
 
     @functools.cached_property
-    def index(self) -> Any:
+    def index(self) -> Real:
         """eta as a constant; matched media, which are answered without Fresnel's equations, keep the number 1."""
         return self.constant(self.eta) if isinstance(self.eta, (int, float)) and self.eta != 1 else self.eta
 
     @functools.cached_property
-    def mu_i_in(self) -> Any:
+    def mu_i_in(self) -> Real:
         return mu_internal(self.mu_i, self.index)
 
     @functools.cached_property
-    def mu_o_in(self) -> Any:
+    def mu_o_in(self) -> Real:
         return mu_internal(self.mu_o, self.index)
 
     @functools.cached_property
-    def sin_i(self) -> Any:
+    def sin_i(self) -> Real:
         """Sine of the refracted angle, sqrt(1 - mu_i²)/eta, at most 1."""
         return self._sine(self.mu_i)
 
     @functools.cached_property
-    def sin_o(self) -> Any:
+    def sin_o(self) -> Real:
         return self._sine(self.mu_o)
 
-    def _sine(self, mu: Any) -> Any:
+    def _sine(self, mu: Real) -> Real:
         return self.lib.minimum(sine(mu) / self.index, 1.0)
 
-    def constant(self, value: Any) -> Any:
+    def constant(self, value: Real) -> Real:
         """A constant of the model (number, or one per channel) in the library and precision of the query."""
         return self.lib.constant(value, self.r)
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
+
+from halfspace_sss.arrays import Library, Real
 
 R_MIN, R_MAX = 1e-5, 1e6  # mean free paths; the table starts and can at most end there
 TAIL_MASS = 1e-4  # least probability of the power-law tail, so that no distance has density 0
@@ -23,7 +24,7 @@ class RadialSampler:
         S: `BSSRDF.eval` of a model of a scalar medium with sigma_t = 1.
     """
 
-    def __init__(self, S: Callable[..., Any], n_cells: int = 256) -> None:
+    def __init__(self, S: Callable[..., Real], n_cells: int = 256) -> None:
         r = np.geomspace(R_MIN, R_MAX, 2 * n_cells)
         mass = r * r * _profile(S, r)
         top = max(float(mass.max()), 1e-300)
@@ -41,7 +42,7 @@ class RadialSampler:
         self.width = np.append(np.diff(self.edges), r_max)
         self.r_max = r_max
 
-    def sample(self, lib: Any, u: Any) -> Any:
+    def sample(self, lib: Library, u: Real) -> Real:
         """Distance r in mean free paths for uniform u in [0, 1)."""
         u64 = lib.float64(u)
         k = lib.interval(self.cdf[:-1], u64)
@@ -51,7 +52,7 @@ class RadialSampler:
         r = lib.where(k == len(self.edges) - 1, self.r_max / (1 - fraction), inner)
         return lib.like(r, u)
 
-    def pdf(self, lib: Any, r: Any) -> Any:
+    def pdf(self, lib: Library, r: Real) -> Real:
         """Density over the plane, 1/mfp²."""
         r64 = lib.float64(r)
         k = lib.interval(self.edges, r64)
@@ -60,7 +61,7 @@ class RadialSampler:
         return lib.like(density * ratio * ratio / (2 * math.pi * lib.maximum(r64, 1e-12)), r)
 
 
-def _profile(S: Callable[..., Any], r: np.ndarray) -> np.ndarray:
+def _profile(S: Callable[..., Real], r: np.ndarray) -> np.ndarray:
     """∫ S mu_i dw_i over directions of incidence at steep exit, averaged over azimuths: what positions follow."""
     mu_i = np.array([0.95, 0.7, 0.4])
     phi = np.linspace(0, math.pi, 5)

@@ -8,8 +8,8 @@ from halfspace_sss.lazy import lazy_names
 
 if TYPE_CHECKING:
     from halfspace_sss.maps.grid import MapGrid
-    from halfspace_sss.maps.store import load_maps, make_maps
+    from halfspace_sss.maps.map_store import load_maps, make_maps
 
 __all__ = ["MapGrid", "load_maps", "make_maps"]
 
-__getattr__, __dir__ = lazy_names(__name__, {"MapGrid": "grid", "load_maps": "store", "make_maps": "store"})
+__getattr__, __dir__ = lazy_names(__name__, {"MapGrid": "grid", "load_maps": "map_store", "make_maps": "map_store"})

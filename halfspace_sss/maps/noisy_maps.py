@@ -259,7 +259,7 @@ def make_pool(
 
     Args:
         groups, grid, events, seed, backend: as in `trace_groups`.
-        folder: that of this run, see `work_folder`.
+        folder: that of this run, see `neural.training.unfinished`.
         progress: called with ("data", launches done, launches in all).
         executor: where launches run (see `halfspace_sss.executors`); by default in this process.
 

@@ -26,8 +26,8 @@ Optional keys: g (with sigma_s_prime; without it g is taken as 0 and may be chos
 tank_ml (the published dilution), note, and a table [sources] that tells for each quantity where its numbers come from.
 """
 
+from halfspace_sss.materials.catalogue import load, names, register, table
 from halfspace_sss.materials.material import Material
-from halfspace_sss.materials.registry import load, names, register, table
 from halfspace_sss.materials.spectra import RGBMedium, SpectralMedium, read_spectra
 from halfspace_sss.materials.tissues import Skin, Tissue, published_tissue, skin, tissue
 

@@ -12,9 +12,8 @@ from halfspace_sss.measure.consistency import (
     reciprocity_gap,
     weight_variance,
 )
-from halfspace_sss.measure.exitance import Moments, moments, profile
 from halfspace_sss.measure.quadrature import Quadrature
-from halfspace_sss.measure.reflected_flux import Integral, reflectance, reflectance_estimate
+from halfspace_sss.measure.reflected_flux import Integral, Moments, moments, profile, reflectance, reflectance_estimate
 
 __all__ = [
     "Integral", "Moments", "Quadrature", "ReciprocityGap", "clamped_energy", "energy_table", "moments", "profile",

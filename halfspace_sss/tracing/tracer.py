@@ -16,7 +16,7 @@ from halfspace_sss.physics.fresnel import F_t
 from halfspace_sss.physics.layers import Layers
 from halfspace_sss.physics.medium import Medium, check_scalar_medium, medium_of
 from halfspace_sss.progress import Progress
-from halfspace_sss.tracing.layers import LayerTrace, trace_layers
+from halfspace_sss.tracing.layer_tracing import LayerTrace, trace_layers
 from halfspace_sss.tracing.passes import Estimate, checked_radii, estimate, order_sum, walk_passes
 from halfspace_sss.tracing.tallies import AngularTally, FluxTally, LineTally, MomentTally, RingTally
 from halfspace_sss.tracing.walk import Tally

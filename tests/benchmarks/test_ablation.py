@@ -32,7 +32,6 @@ from benchmarks.budgets import Samples, Seconds, Within
 from halfspace_sss import Medium, materials
 from halfspace_sss.arrays import library
 from halfspace_sss.comparison.model_errors import ReferenceSize, TracedMaps, model_error, reference_maps
-from halfspace_sss.kept_rows import KeptRows
 from halfspace_sss.maps import noisy_maps
 from halfspace_sss.maps.noisy_maps import CellGrid, draw_directions, make_pool
 from halfspace_sss.neural.paper_model import paper_inputs
@@ -40,6 +39,7 @@ from halfspace_sss.neural.training import train_material as training
 from halfspace_sss.neural.training.fit import Fit, fit
 from halfspace_sss.neural.training.pool import MapPool
 from halfspace_sss.neural.training.train_material import MaterialRecipe
+from halfspace_sss.provenance import KeptRows
 
 FIG10 = materials.load("fig10").medium
 GRID, HOW = CellGrid(8, 4), Fit(steps=1, n_groups=4, n_queries=32)

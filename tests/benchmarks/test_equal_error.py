@@ -13,7 +13,7 @@ import pytest
 from benchmarks import equal_error, equal_error_tables
 from benchmarks.equal_error import MODELLED, STEPS, furnace, furnace_models, modelled_contender, modelled_scene
 from figures.computing.contenders import MODELS, VOLUMES, WALK, contender
-from figures.computing.scenes import MM_PER_UNIT, prepare
+from figures.computing.scans import MM_PER_UNIT, prepare
 from figures.computing.timed import TimedRender, rendered
 from figures.parts.part import Part, Result, Task
 from full_geometry.learning import training

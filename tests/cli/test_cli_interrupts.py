@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from halfspace_sss.maps.store import load_maps
+from halfspace_sss.maps.map_store import load_maps
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
 
@@ -114,7 +114,7 @@ finally:
 def test_a_kernel_that_hears_nothing_is_told_of_and_ended_by_the_next_interrupt(tmp_path: Path) -> None:
     body = """
 import ctypes
-from halfspace_sss.cli import interrupts as cli_interrupts
+from halfspace_sss import interrupts as cli_interrupts
 cli_interrupts.PATIENCE = 0.3
 print('ready', flush=True)
 mutex = ctypes.create_string_buffer(128)
@@ -151,7 +151,7 @@ def test_maps_of_a_slow_medium_end_within_two_seconds_and_keep_what_is_finished(
     body = """
 import halfspace_sss as sss
 from halfspace_sss.maps.grid import MapGrid
-from halfspace_sss.maps.store import make_maps
+from halfspace_sss.maps.map_store import make_maps
 media = {"quick": sss.Medium.from_albedo(0.1, 1.0, 0.0, 1.5), "slow": sss.Medium.from_albedo(0.9999, 1.0, 0.9, 1.5)}
 def told(done, total, what):
     if done == 2:

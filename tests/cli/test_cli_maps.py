@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from figures import app as cli
 from halfspace_sss import materials
-from halfspace_sss.maps.store import load_maps
+from halfspace_sss.maps.map_store import load_maps
 
 SMALL = ("--grid", "2,16,6,4", "--paths", "2048")
 
@@ -63,7 +63,7 @@ def test_shares_fill_a_store_that_the_last_call_only_checks(tmp_path: Path, monk
         result = _invoke(*SMALL, "--share", share, "--out", str(tmp_path))
         assert result.exit_code == 0
         assert f"share {share} is done" in result.stdout
-    monkeypatch.setattr("halfspace_sss.maps.store.trace_unit", None)
+    monkeypatch.setattr("halfspace_sss.maps.map_store.trace_unit", None)
     result = _invoke(*SMALL, "--out", str(tmp_path))
     assert result.exit_code == 0
     assert "100 %" in result.stderr

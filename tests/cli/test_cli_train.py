@@ -14,7 +14,7 @@ from figures import app as cli
 from halfspace_sss import bssrdf, materials
 from halfspace_sss.maps import noisy_maps
 from halfspace_sss.maps.noisy_maps import CellGrid
-from halfspace_sss.materials import registry
+from halfspace_sss.materials import catalogue as registry
 from halfspace_sss.neural import material_model, paper_model, store
 from halfspace_sss.neural.store import load_weights
 from halfspace_sss.neural.training import train_material, train_universal

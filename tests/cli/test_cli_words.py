@@ -14,9 +14,9 @@ from typer.testing import CliRunner
 
 import halfspace_sss
 from figures import app as cli
+from halfspace_sss import interrupts as cli_interrupts
 from halfspace_sss import materials
 from halfspace_sss.cli import errors as cli_errors
-from halfspace_sss.cli import interrupts as cli_interrupts
 from halfspace_sss.cli import shared
 from halfspace_sss.materials import Material
 from halfspace_sss.physics.medium import Medium

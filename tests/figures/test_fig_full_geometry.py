@@ -15,7 +15,8 @@ pytest.importorskip("flip_evaluator")
 import benchmarks.__main__  # noqa: E402, F401 - its figures
 from benchmarks.published import distant_light, fig07, table1  # noqa: E402
 from figures import fig01, fig06, fig09, fig11  # noqa: E402
-from figures.computing import learnt, scenes  # noqa: E402
+from figures.computing import learnt  # noqa: E402
+from figures.computing import scans as scenes
 from figures.computing.contenders import OF_OBJECTS, VOLUMES  # noqa: E402
 from figures.parts import runner  # noqa: E402
 from figures.parts.part import Result, keys_of  # noqa: E402

@@ -10,7 +10,7 @@ igl = pytest.importorskip("igl")
 
 import mitsuba as mi  # noqa: E402
 
-from figures.computing import scenes  # noqa: E402
+from figures.computing import scans as scenes  # noqa: E402
 from figures.modelling import candle, objects  # noqa: E402
 from full_geometry.learning import meshes  # noqa: E402
 

@@ -8,7 +8,7 @@ import pytest
 mi = pytest.importorskip("mitsuba")
 igl = pytest.importorskip("igl")
 
-from figures.computing.scenes import SCANS, prepare  # noqa: E402
+from figures.computing.scans import SCANS, prepare  # noqa: E402
 
 
 @pytest.mark.parametrize("scan", SCANS)

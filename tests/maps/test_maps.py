@@ -13,8 +13,8 @@ import pytest
 
 from halfspace_sss import Medium, make_maps, trace
 from halfspace_sss.maps.grid import MapGrid, cell_edges, map_directions, radial_scale
+from halfspace_sss.maps.map_store import _template, load_maps
 from halfspace_sss.maps.map_tracing import MapUnit, trace_unit
-from halfspace_sss.maps.store import _template, load_maps
 from halfspace_sss.tracing.tracer import Line, trace_curve
 
 FIG10 = Medium.from_albedo(0.75, 1.0, 0.0, 1.3)
@@ -150,7 +150,7 @@ def test_a_process_that_makes_the_store_second_takes_that_of_the_first(store, mo
         of_the_first.rename(store)
         return _template(*arguments)
 
-    monkeypatch.setattr("halfspace_sss.maps.store._template", template)
+    monkeypatch.setattr("halfspace_sss.maps.map_store._template", template)
     make_maps({"m": FIG10}, store.parent, grid=SMALL, target_error=None, n_paths=1024)
     assert [path.name for path in store.parent.iterdir()] == ["m.zarr"]
     load_maps(store)

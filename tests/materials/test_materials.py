@@ -14,7 +14,8 @@ from registered import FILE
 
 import halfspace_sss
 from halfspace_sss import Medium
-from halfspace_sss.materials import Material, load, names, registry, table
+from halfspace_sss.materials import Material, load, names, table
+from halfspace_sss.materials import catalogue as registry
 
 
 def test_there_are_two_published_sets_and_the_medium_of_fig_10(fresh):

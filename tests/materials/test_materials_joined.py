@@ -10,7 +10,8 @@ import pytest
 from registered import FILE
 
 from halfspace_sss import Medium
-from halfspace_sss.materials import Material, load, names, registry
+from halfspace_sss.materials import Material, load, names
+from halfspace_sss.materials import catalogue as registry
 
 
 class EntryPoint:

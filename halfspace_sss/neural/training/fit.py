@@ -17,7 +17,7 @@ from typing import NamedTuple, Protocol
 import torch
 
 from halfspace_sss.checks import check_count, check_interval
-from halfspace_sss.neural.training import checkpoint
+from halfspace_sss.neural.training.unfinished import gone_on_with, write_checkpoint
 from halfspace_sss.progress import NamedProgress
 
 LAST_RATE = 0.002  # of the largest
@@ -281,7 +281,7 @@ class _FitState:
 
     def save(self, path: Path) -> None:
         rows = [[h[k] for k in ("step", "loss", "error", "seconds")] for h in self.history]
-        checkpoint.write(
+        write_checkpoint(
             path, self.descent.tensors(),
             generator=self.generator.get_state(), counter=torch.tensor([self.step, self.loss], dtype=torch.float64),
             history=torch.tensor(rows, dtype=torch.float64).reshape(-1, 4),
@@ -289,7 +289,7 @@ class _FitState:
 
     def load(self, path: Path, target_error: float | None) -> None:
         """Go on from a checkpoint; ValueError if it is damaged or of another architecture."""
-        with checkpoint.gone_on_with(path, self.descent.tensors()) as stored:
+        with gone_on_with(path, self.descent.tensors()) as stored:
             self.generator.set_state(stored["generator"])
             step, self.loss = stored["counter"].tolist()
             rows = stored["history"].tolist()

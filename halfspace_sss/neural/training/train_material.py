@@ -27,7 +27,7 @@ from halfspace_sss.neural.symmetric import SymmetricModel, channels
 from halfspace_sss.neural.training.fit import Fit, fit
 from halfspace_sss.neural.training.learners import PaperLearner, Small
 from halfspace_sss.neural.training.pool import MapPool
-from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
+from halfspace_sss.neural.training.unfinished import CHECKPOINT, claim
 from halfspace_sss.neural.universal import load_hypernetwork, shipped_weights
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress

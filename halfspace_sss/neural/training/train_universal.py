@@ -39,7 +39,7 @@ from halfspace_sss.neural.training.fit import Fit, fit
 from halfspace_sss.neural.training.learners import Hyper
 from halfspace_sss.neural.training.pool import MapPool, torch_library
 from halfspace_sss.neural.training.train_material import Trial
-from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
+from halfspace_sss.neural.training.unfinished import CHECKPOINT, claim
 from halfspace_sss.neural.universal import hypernetwork_of
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.backbone import length_scale
