@@ -1,8 +1,7 @@
 """The figures of the paper: what each is made of, apart from how it is drawn, so that only what changed is computed.
 
-A figure is one file, `figures/NAME.py` or, where the paper has none of the kind, `figures/beyond/NAME.py`, and one
-entry below; other packages add figures by entry points of the group `halfspace_sss.figure_modules`, name = module. The
-module has
+A figure is one file, `figures/NAME.py`, and one entry below; other packages add figures by entry points of the group
+`halfspace_sss.figure_modules`, name = module. The module has
 
 - `TITLE`: a few words for `halfspace-sss figures list`;
 - `parts(quality) -> list[Part]`: what is to be computed, for the quality "draft" (minutes on two cores) or "paper";
@@ -39,9 +38,7 @@ from importlib.metadata import entry_points
 
 __all__ = ["FIGURES", "figure_modules"]
 
-OF_PAPER = ("fig01", "fig05", "fig06", "fig09", "fig10", "fig11", "fig12")
-BEYOND = ("spheres", "thin", "textures", "gathered", "scenes")
-FIGURES = (*OF_PAPER, *BEYOND)
+FIGURES = ("fig01", "fig05", "fig06", "fig09", "fig10", "fig11", "fig12", "thin", "textures", "scenes")
 GROUP = "halfspace_sss.figure_modules"
 ADDED: dict[str, str] = {}  # name -> module of figures that a program adds, as `benchmarks` does
 
@@ -49,5 +46,5 @@ ADDED: dict[str, str] = {}  # name -> module of figures that a program adds, as 
 def figure_modules() -> dict[str, str]:
     """The module of each figure by its name, those of other packages last; a name that is taken is not given anew."""
     added = {entry.name: entry.value for entry in entry_points(group=GROUP)} | ADDED
-    own = {name: f"figures.{'beyond.' if name in BEYOND else ''}{name}" for name in FIGURES}
+    own = {name: f"figures.{name}" for name in FIGURES}
     return own | {name: module for name, module in added.items() if name not in own}

@@ -29,7 +29,7 @@ FLOORS = {  # of each package, a room or file may import those to its left; "" i
         "", "geometry", "surface", "objects", "walk", "transport", "precomputed", "integrators", "scenes",
         "learning", "inverse", "trade", "plugins", "cli",
     ],
-    "figures": ["parts", "modelling", "computing", "drawing", "beyond", ""],
+    "figures": ["parts", "modelling", "computing", "drawing", ""],
 }  # fmt: skip
 ENTRY_POINTS = {"halfspace_sss.models"}  # by which packages above join the plane
 HIDING = {"bssrdf", "curves", "models", "trace"}  # public functions: a folder of that name would hide one

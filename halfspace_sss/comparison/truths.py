@@ -19,7 +19,7 @@ from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import Progress
 from halfspace_sss.tracing.passes import Estimate, estimate, walk_passes
 from halfspace_sss.tracing.tracer import Trace, trace
-from halfspace_sss.tracing.walk import Boundary, Scatter
+from halfspace_sss.tracing.walk import Boundary, Tally
 
 TABLE = Path(__file__).parent / "data" / "truths.csv"
 MEASURES = {
@@ -224,7 +224,7 @@ class Validation:
         return [c for c in self.comparisons if not abs(c.z) < Z_LIMIT]
 
 
-class OrderTally:
+class OrderTally(Tally):
     """Flux through the boundary after exactly `order` scattering events."""
 
     def __init__(self, types: object, order: int) -> None:
@@ -239,9 +239,6 @@ class OrderTally:
         import drjit as dr
 
         return (sums[0] + dr.select(event.order == self.order, event.weight, 0.0),)
-
-    def scatter(self, sums: tuple, event: Scatter) -> tuple:
-        return sums
 
 
 def trace_order(

@@ -18,7 +18,7 @@ from halfspace_sss.physics.fresnel import F_t, mu_internal
 from halfspace_sss.physics.medium import Medium, eval_hg
 from halfspace_sss.tracing.passes import PATHS_PER_LANE
 from halfspace_sss.tracing.tallies import CellSums
-from halfspace_sss.tracing.walk import Boundary, Scatter, pass_seed, walk
+from halfspace_sss.tracing.walk import Scatter, Tally, pass_seed, walk
 
 GROUP = 16  # observations that share a walk
 HITS = 2  # scores per event, one in each half of the summed contributions
@@ -58,7 +58,7 @@ class UnitResult:
 
 
 @dataclass(eq=False)
-class MapTally:
+class MapTally(Tally):
     """Order >= 2 radiance towards 16 observations over cells of the plane, without Fresnel factors.
 
     At each event one observation is drawn in proportion to its contribution q_k = p(d.d_k) exp(-z/mu_k) / (eta² mu_k)
@@ -83,12 +83,6 @@ class MapTally:
     low: Lanes
     rate: Lanes
     cells: CellSums
-
-    def start(self, lanes: int) -> tuple:
-        return ()
-
-    def boundary(self, sums: tuple, event: Boundary) -> tuple:
-        return sums
 
     def scatter(self, sums: tuple, event: Scatter) -> tuple:
         import drjit as dr

@@ -168,9 +168,6 @@ class _Tally:
             self.edges2 = types.Float(np.asarray(edges, dtype=np.float64) ** 2)
             self.rings = CellSums(types, 3 * (self.n + 1) * self.n_rings)
 
-    def start(self, lanes: int) -> tuple:
-        return ()
-
     def event(self, event: Boundary, crosses, transmitted, deepest, layer, absorbed) -> None:
         """Add what leaves at an outer boundary (`event`), or what a scattering event in `layer` absorbs."""
         import drjit as dr

@@ -14,7 +14,7 @@ import numpy as np
 from halfspace_sss.arrays import Lanes
 from halfspace_sss.physics.fresnel import mu_internal
 from halfspace_sss.physics.medium import eval_hg
-from halfspace_sss.tracing.walk import Boundary, Scatter
+from halfspace_sss.tracing.walk import Boundary, Scatter, Tally
 
 FIXED_POINT = 2.0**32  # quantum 2.3e-10 of a unit weight; a cell holds up to 4e9 unit weights
 BATCHES = 64  # independent groups of lanes, from whose spread the variance of a cell is taken
@@ -27,7 +27,7 @@ def _split(order: Lanes, value: Lanes) -> tuple[Lanes, Lanes]:
     return dr.select(order == 1, value, 0.0), dr.select(order > 1, value, 0.0)
 
 
-class FluxTally:
+class FluxTally(Tally):
     """Flux through the boundary per entered flux: sums (single, multiple)."""
 
     def __init__(self, types: ModuleType) -> None:
@@ -41,11 +41,8 @@ class FluxTally:
     def boundary(self, sums: tuple, event: Boundary) -> tuple:
         return tuple(s + v for s, v in zip(sums, _split(event.order, event.weight)))
 
-    def scatter(self, sums: tuple, event: Scatter) -> tuple:
-        return sums
 
-
-class MomentTally:
+class MomentTally(Tally):
     """Flux times r², x and path length: sums (r² single, r² multiple, x single, ..., length multiple)."""
 
     def __init__(self, types: ModuleType) -> None:
@@ -65,11 +62,8 @@ class MomentTally:
         parts = [part for value in values for part in _split(event.order, value)]
         return tuple(s + v for s, v in zip(sums, parts))
 
-    def scatter(self, sums: tuple, event: Scatter) -> tuple:
-        return sums
 
-
-class AngularTally:
+class AngularTally(Tally):
     """Radiance towards given outside directions integrated over the plane, without Fresnel factors.
 
     At each event: weight p(d.d_o) exp(-z/mu_o') / (eta² mu_o'), for each direction (single, multiple).
@@ -91,9 +85,6 @@ class AngularTally:
         import drjit as dr
 
         return tuple(dr.zeros(self.types.Float, lanes) for _ in range(2 * len(self.mu)))
-
-    def boundary(self, sums: tuple, event: Boundary) -> tuple:
-        return sums
 
     def scatter(self, sums: tuple, event: Scatter) -> tuple:
         import drjit as dr
@@ -130,7 +121,7 @@ class CellSums:
         return self.sums.numpy().reshape(self.batches, self.cells).astype(np.float64) / FIXED_POINT
 
 
-class RingTally:
+class RingTally(Tally):
     """Flux through rings of the plane between consecutive radii; cells (order, ring)."""
 
     def __init__(self, types: ModuleType, edges: np.ndarray) -> None:
@@ -138,20 +129,14 @@ class RingTally:
         self.edges2 = types.Float(np.asarray(edges, dtype=np.float64) ** 2)
         self.cells = CellSums(types, 2 * self.n)
 
-    def start(self, lanes: int) -> tuple:
-        return ()
-
     def boundary(self, sums: tuple, event: Boundary) -> tuple:
         ring, inside = find_cell(self.edges2, event.x * event.x + event.y * event.y)
         cell = ring + (event.order > 1) * type(ring)(self.n)
         self.cells.add(event.weight, cell, event.lane, inside & (event.weight > 0))
         return sums
 
-    def scatter(self, sums: tuple, event: Scatter) -> tuple:
-        return sums
 
-
-class LineTally:
+class LineTally(Tally):
     """Radiance of order >= 2 towards one outside direction, over cells of a sector about a line from the origin.
 
     Cells are ring segments between consecutive radii within `half_width` radians of the azimuth `line_phi`.
@@ -173,12 +158,6 @@ class LineTally:
         low, high = max(line - half_width, 0.0), min(line + half_width, math.pi)
         self.angle = {"rotation": 2 * math.pi, "mirror": 2 * (high - low), "none": 2 * half_width}[symmetry]
         self.areas = 0.5 * self.angle * np.diff(np.asarray(edges, dtype=np.float64) ** 2)
-
-    def start(self, lanes: int) -> tuple:
-        return ()
-
-    def boundary(self, sums: tuple, event: Boundary) -> tuple:
-        return sums
 
     def scatter(self, sums: tuple, event: Scatter) -> tuple:
         import drjit as dr

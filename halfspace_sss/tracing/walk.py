@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Protocol
 
 import numpy as np
 
@@ -63,17 +62,20 @@ class Scatter:
     random: Callable[[], Lanes]  # further uniform numbers
 
 
-class Tally(Protocol):
+class Tally:
     """What is recorded. Per-lane sums live in `start`'s tuple of arrays; anything else is scattered to memory."""
 
     def start(self, lanes: int) -> tuple:
-        """Per-lane sums at zero."""
+        """Per-lane sums at zero; by default none."""
+        return ()
 
     def boundary(self, sums: tuple, event: Boundary) -> tuple:
-        """Sums after a meeting with the surface."""
+        """Sums after a meeting with the surface; by default as they were."""
+        return sums
 
     def scatter(self, sums: tuple, event: Scatter) -> tuple:
-        """Sums after a scattering event."""
+        """Sums after a scattering event; by default as they were."""
+        return sums
 
 
 @dataclass(frozen=True)

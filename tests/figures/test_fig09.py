@@ -11,8 +11,9 @@ import pytest
 pytest.importorskip("mitsuba")
 pytest.importorskip("flip_evaluator")
 
+import benchmarks.__main__  # noqa: F401 - its figures
+from benchmarks import spheres_figure as spheres
 from figures import fig09
-from figures.beyond import spheres
 from figures.parts import runner  # noqa: E402
 
 pytestmark = pytest.mark.slow

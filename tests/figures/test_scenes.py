@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("mitsuba")
 pytest.importorskip("igl")
 
-from figures.beyond import scenes  # noqa: E402
+from figures import scenes  # noqa: E402
 from figures.modelling import head  # noqa: E402
 from full_geometry.learning.meshes import make_shape  # noqa: E402
 

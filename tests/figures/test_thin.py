@@ -13,7 +13,7 @@ pytest.importorskip("mitsuba")
 pytest.importorskip("igl")
 pytest.importorskip("flip_evaluator")
 
-from figures.beyond import thin  # noqa: E402
+from figures import thin  # noqa: E402
 from figures.parts import runner  # noqa: E402
 
 

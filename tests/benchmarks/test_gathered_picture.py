@@ -8,7 +8,7 @@ import numpy as np
 import pandas
 import pytest
 
-from figures.beyond import gathered
+from benchmarks import gathered_figure as gathered
 from figures.computing.learnt import FULL_GEOMETRY
 from figures.parts.part import Result, Task
 
