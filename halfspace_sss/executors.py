@@ -16,11 +16,14 @@ from contextlib import ExitStack, contextmanager
 from heapq import heappop, heappush
 from pathlib import Path
 from queue import SimpleQueue
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import halfspace_sss
 from halfspace_sss.backend import BackendError, cores, limit_threads
 from halfspace_sss.checks import check_count
+
+if TYPE_CHECKING:
+    from distributed import Worker
 
 R = TypeVar("R")
 LOCAL = "local"  # in place of an address: a cluster of Dask on this machine
@@ -129,10 +132,18 @@ def scheduler(address: str, say: Callable[[str], object] | None = None) -> Itera
     """
     try:
         from distributed import Client, KilledWorker, LocalCluster
-
-        from halfspace_sss.dask_worker import WorkerSetUp
+        from distributed.diagnostics.plugin import WorkerPlugin
     except ModuleNotFoundError as error:
         raise BackendError(f'a scheduler needs {error.name}: pip install "halfspace-sss[cluster]"') from error
+
+    class WorkerSetUp(WorkerPlugin):
+        """What every worker does before its first part."""
+
+        name, version = "halfspace-sss", halfspace_sss.__version__
+
+        def setup(self, worker: Worker) -> None:
+            _set_up(worker, self.version)
+
     with ExitStack() as stack:
         if address == LOCAL:
             cluster = LocalCluster(n_workers=cores(), threads_per_worker=1, dashboard_address="127.0.0.1:0")
@@ -144,11 +155,26 @@ def scheduler(address: str, say: Callable[[str], object] | None = None) -> Itera
             raise BackendError(f"no scheduler answers at {address}: {error}") from error
         if say and client.dashboard_link:
             say(f"dashboard of Dask: {client.dashboard_link}")
-        client.register_plugin(WorkerSetUp(halfspace_sss.__version__))
+        client.register_plugin(WorkerSetUp())
         try:
             yield client.get_executor(pure=False)
         except KilledWorker as error:
             raise BackendError(f"workers ended again and again under one part: {error}") from error
+
+
+def _set_up(worker: Worker, version: str) -> None:
+    """Refuse workers that would give other numbers or hang, and give the others the threads of OMP_NUM_THREADS.
+
+    Dask gives each worker OMP_NUM_THREADS = 1 unless its configuration says another number.
+    """
+    if halfspace_sss.__version__ != version:
+        raise ValueError(f"worker {worker.name} must have halfspace-sss {version}, got {halfspace_sss.__version__}")
+    if worker.state.nthreads != 1:
+        raise ValueError(
+            f"worker {worker.name} must run one part at a time (--nthreads 1, OMP_NUM_THREADS for the threads of a "
+            f"part), got {worker.state.nthreads} threads"
+        )
+    limit_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
 
 
 def _begin(threads: int) -> None:

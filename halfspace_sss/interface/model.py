@@ -6,17 +6,21 @@ import abc
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import ClassVar, NamedTuple
+from types import ModuleType
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
-from halfspace_sss.arrays import Library, Real, asks_nothing, broadcast_query
+from halfspace_sss.arrays import Library, Real, asks_nothing, broadcast_query, is_torch
 from halfspace_sss.checks import check_query
-from halfspace_sss.interface.gradient_blocks import recorded_in_blocks
 from halfspace_sss.interface.query import Query
-from halfspace_sss.interface.radial_sampling import RadialSampler
+from halfspace_sss.lazy import once
 from halfspace_sss.physics.fresnel import C_phi, F_t
 from halfspace_sss.physics.medium import Medium
+
+if TYPE_CHECKING:
+    import torch
+    from torch.autograd.function import FunctionCtx
 
 FARTHEST = 0.44  # of the exponent range: in mean free paths, where r² is finite and r⁻³ is 0 in every precision
 
@@ -249,3 +253,149 @@ class Separable(BSSRDF):
 
     def G(self, q: Query) -> Real:
         return self.R_d(q) / q.constant(math.pi * self.N)
+
+
+# ---- Distances between entry and exit, drawn by the radial profile of a model
+
+R_MIN, R_MAX = 1e-5, 1e6  # mean free paths; the table starts and can at most end there
+TAIL_MASS = 1e-4  # least probability of the power-law tail, so that no distance has density 0
+
+
+class RadialSampler:
+    """Piecewise density over r in mean free paths, exact to sample and to evaluate.
+
+    Cells are uniform in log r below the radius where r² R(r) has died out; within a cell r is uniform, so
+    the density over the plane is P_k / (2 pi r (r_{k+1} - r_k)). Beyond the last edge r_max the tail follows
+    r_max / r², which covers the plane also where a profile falls as r⁻³ (no absorption).
+
+    Args:
+        S: `BSSRDF.eval` of a model of a scalar medium with sigma_t = 1.
+    """
+
+    def __init__(self, S: Callable[..., Real], n_cells: int = 256) -> None:
+        r = np.geomspace(R_MIN, R_MAX, 2 * n_cells)
+        mass = r * r * _profile(S, r)
+        top = max(float(mass.max()), 1e-300)
+        beyond = np.nonzero(mass > 1e-7 * top)[0]
+        r_max = r[min(beyond[-1] + 1, len(r) - 1)] if len(beyond) else 1.0
+        self.edges = np.concatenate([[0.0], np.geomspace(R_MIN, r_max, n_cells)])
+        middle = np.concatenate([[0.5 * R_MIN], np.sqrt(self.edges[1:-1] * self.edges[2:])])
+        weight = middle * _profile(S, middle) * np.diff(self.edges)
+        if not weight.sum() > 0:
+            weight = np.diff(np.log(np.maximum(self.edges, 0.5 * R_MIN)))
+        probability = np.append((1 - TAIL_MASS) * weight / weight.sum(), TAIL_MASS)
+        self.cdf = np.concatenate([[0.0], np.cumsum(probability)])
+        self.cdf[-1] = 1.0
+        self.probability = np.diff(self.cdf)
+        self.width = np.append(np.diff(self.edges), r_max)
+        self.r_max = r_max
+
+    def sample(self, lib: Library, u: Real) -> Real:
+        """Distance r in mean free paths for uniform u in [0, 1)."""
+        u64 = lib.float64(u)
+        k = lib.interval(self.cdf[:-1], u64)
+        fraction = (u64 - lib.take(self.cdf[:-1], k, u64)) / lib.maximum(lib.take(self.probability, k, u64), 1e-300)
+        fraction = lib.minimum(lib.maximum(fraction, 0.0), 1 - 1e-12)
+        inner = lib.take(self.edges, k, u64) + fraction * lib.take(self.width, k, u64)
+        r = lib.where(k == len(self.edges) - 1, self.r_max / (1 - fraction), inner)
+        return lib.like(r, u)
+
+    def pdf(self, lib: Library, r: Real) -> Real:
+        """Density over the plane, 1/mfp²."""
+        r64 = lib.float64(r)
+        k = lib.interval(self.edges, r64)
+        density = lib.take(self.probability / self.width, k, r64)
+        ratio = self.r_max / lib.maximum(r64, self.r_max)  # 1 inside the table
+        return lib.like(density * ratio * ratio / (2 * math.pi * lib.maximum(r64, 1e-12)), r)
+
+
+def _profile(S: Callable[..., Real], r: np.ndarray) -> np.ndarray:
+    """∫ S mu_i dw_i over directions of incidence at steep exit, averaged over azimuths: what positions follow."""
+    mu_i = np.array([0.95, 0.7, 0.4])
+    phi = np.linspace(0, math.pi, 5)
+    values = S(r[:, None, None], mu_i[:, None], phi, 0.9, 0.5 * math.pi)
+    values = np.where(np.isfinite(values), values, 0.0)
+    return (values * mu_i[:, None]).mean(axis=(1, 2))
+
+
+# ---- Derivatives by torch in blocks of queries, so that their memory is bounded
+
+BLOCK_BYTES = 1 << 27  # that torch keeps of one block
+PROBE = 64  # queries
+
+
+def recorded_in_blocks(lib: Library, f: Callable[..., Real], args: tuple) -> Real:
+    """f(*args), a function of each query alone, so that torch keeps the arguments for its derivatives and no more.
+
+    torch keeps what every operation was given, tens of kB a query where a model integrates. Queries that would exceed
+    `BLOCK_BYTES` are therefore split, and each block is recorded when it is gone through backwards. Other libraries,
+    and what is not differentiated or depends on further tensors that are, are answered at once.
+    """
+    if not _recorded(lib, args):
+        return f(*args)
+    torch, shape = lib.torch, args[0].shape
+    flat = [a.reshape(-1) for a in args]
+    if f(*(a[:1].detach() for a in flat)).requires_grad:
+        return f(*args)
+    size = max(PROBE, int(BLOCK_BYTES / max(_kept_bytes(torch, f, flat), 1.0)))
+    if len(flat[0]) <= size:
+        return f(*args)
+    blocks = zip(*(a.split(size) for a in flat))
+    values = torch.cat([_block_class().apply(f, *block) for block in blocks])
+    return values.reshape(*shape, *values.shape[1:])
+
+
+def _recorded(lib: Library, args: tuple) -> bool:
+    """Whether torch records derivatives for going backwards, and of more queries than the probes take."""
+    if not is_torch(lib) or not lib.torch.is_grad_enabled() or args[0].numel() <= 2 * PROBE:
+        return False
+    forward = lib.torch.autograd.forward_ad.unpack_dual
+    if lib.torch._C._are_functorch_transforms_active() or any(forward(a).tangent is not None for a in args):
+        return False
+    return any(a.requires_grad for a in args)
+
+
+def _kept_bytes(torch: ModuleType, f: Callable[..., Real], flat: list) -> float:
+    """What the graph of f keeps of one query: by how much that of two probes differs from that of one."""
+    sizes = []
+    for n in (PROBE, 2 * PROBE):
+        kept: dict[int, int] = {}
+
+        def keep(tensor: torch.Tensor, kept: dict = kept) -> torch.Tensor:
+            storage = tensor.untyped_storage()
+            kept[storage.data_ptr()] = storage.nbytes()
+            return tensor
+
+        probe = [a[:n].clone().detach().requires_grad_(a.requires_grad) for a in flat]
+        with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
+            graph = f(*probe)
+        sizes.append(sum(kept.values()))
+        del graph
+    return (sizes[1] - sizes[0]) / PROBE
+
+
+@once
+def _block_class() -> type:
+    import torch
+
+    class Block(torch.autograd.Function):
+        """f(*args), recorded when its derivatives are asked for; those of higher order are recorded whole."""
+
+        @staticmethod
+        def forward(ctx: FunctionCtx, f: Callable[..., Real], *args: torch.Tensor) -> torch.Tensor:
+            ctx.f = f
+            ctx.save_for_backward(*args)
+            return f(*args)
+
+        @staticmethod
+        def backward(ctx: FunctionCtx, outer: torch.Tensor) -> tuple:
+            again, needed = torch.is_grad_enabled(), ctx.needs_input_grad[1:]
+            args = [a if again else a.detach().requires_grad_(n) for a, n in zip(ctx.saved_tensors, needed)]
+            inputs = [a for a, n in zip(args, needed) if n]
+            with torch.enable_grad():
+                value = ctx.f(*args)
+                result = torch.autograd.grad(value, inputs, outer, create_graph=again, allow_unused=True)
+            grads = iter(result)
+            return None, *(next(grads) if n else None for n in needed)
+
+    return Block

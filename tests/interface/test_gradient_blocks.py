@@ -12,7 +12,7 @@ import torch
 import halfspace_sss
 from halfspace_sss import Medium
 from halfspace_sss.arrays import library
-from halfspace_sss.interface import gradient_blocks
+from halfspace_sss.interface import model as gradient_blocks
 
 MEDIUM = Medium(1.8075, 0.6025, 0.0, 1.3)
 RGB = Medium([1.0, 2.0, 0.5], [0.1, 0.01, 0.2], 0.3, 1.4)

@@ -7,7 +7,7 @@ import pytest
 
 from halfspace_sss import Medium, bssrdf
 from halfspace_sss.arrays import library
-from halfspace_sss.interface.radial_sampling import TAIL_MASS, RadialSampler
+from halfspace_sss.interface.model import TAIL_MASS, RadialSampler
 
 LIB = library(0.0)
 

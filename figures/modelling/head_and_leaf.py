@@ -1,6 +1,7 @@
-"""A head that is painted: its surface, texture coordinates around it, and the paint. Units of about a head's width / 2.
+"""A leaf, and a head that is painted: its surface, texture coordinates around it, and the paint.
 
-Texture coordinates are the azimuth about y, 0.5 in front, and the height; the seam is at the back.
+Units are about half the width of the head. Texture coordinates are the azimuth about y, 0.5 in front, and the height;
+the seam is at the back.
 """
 
 from __future__ import annotations
@@ -10,7 +11,19 @@ from pathlib import Path
 import numpy as np
 
 from figures.parts.part import SceneDict
-from full_geometry.learning.meshes import Box, Mesh, capsule, cut, ellipsoid, join, overlap, smoothstep, surface
+from full_geometry.learning.meshes import (
+    Box,
+    Distance,
+    Mesh,
+    capsule,
+    cut,
+    ellipsoid,
+    join,
+    margin,
+    overlap,
+    smoothstep,
+    surface,
+)
 
 BOX = Box((-1.3, -2.1, -1.5), (1.3, 1.6, 1.6))
 TEXELS = 512  # around and along the height
@@ -112,3 +125,27 @@ def write_painted(mesh: Mesh, path: Path) -> SceneDict:
     texels = np.ascontiguousarray(paint(), dtype=np.float32)
     texture = {"type": "bitmap", "bitmap": mi.Bitmap(texels), "raw": True}
     return {"shape": {"type": "ply", "filename": str(path)}, "paint": texture}
+
+
+Made = tuple[Distance, Box]
+
+
+def leaves(rng: np.random.Generator) -> Made:
+    """A bent leaf with a rib and a stalk, of a family of shapes that `neural_shape` was not trained on."""
+    long, wide, thick = rng.uniform(0.7, 1.0), rng.uniform(0.25, 0.5), rng.uniform(0.025, 0.07)
+    bend, fold = rng.uniform(0, 0.5), rng.uniform(0, 0.4)
+
+    def distance(p: np.ndarray) -> np.ndarray:
+        x, y, z = np.moveaxis(p, -1, 0)
+        z = z - bend * x * x - fold * np.abs(y)
+        edge = np.abs(y) - wide * np.clip(1 - (x / long) ** 2, 0, 1)
+        leaf = overlap(np.maximum(edge, np.abs(x) - long) / 2, (np.abs(z) - thick) / (1 + bend + fold), 0.02)
+        bent = np.stack([x, y, z], axis=-1)
+        rib = capsule(bent, (-1.25 * long, 0, 0), (0.8 * long, 0, 0), 0.07, 0.04)
+        return join(leaf, rib / (1 + bend + fold), 0.03)
+
+    high = bend * 1.6 * long**2 + fold * wide + 0.12
+    return distance, margin((-1.35 * long, -wide, -0.15), (long + 0.02, wide, high))
+
+
+LEAVES = {"leaves": leaves}
