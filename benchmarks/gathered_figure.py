@@ -62,7 +62,7 @@ def in_time(task: Task) -> dict[str, object]:
         for way, (model, light) in WAYS.items():
 
             def load(model: str = model, light: str = light) -> mi.Scene:
-                description = scan_scene("bunny", p["material"], p["size"], p["lights"])
+                description = scan_scene(p["material"], p["size"], p["lights"])
                 return load_scene(description, model, settings={"light": light})
 
             found[way], numbers[way] = _passes(load, p["seconds"], p["seed"], light)

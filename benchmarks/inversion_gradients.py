@@ -58,7 +58,7 @@ def gradient_rows(case: str, size: int, spp: int, seed: int, progress: NamedProg
         progress: called with (what, done, total).
     """
     scan, eta = CASES[case]
-    description = scan_scene(scan, "potato", size)
+    description = scan_scene("potato", size, scan=scan)
     description[scan]["bsdf"] = {"type": "translucent", **MEDIUM, "eta": eta}
     description["sky"] = {"type": "constant", "radiance": 0.15}
     unit = SCANS[scan].mm_per_unit

@@ -92,7 +92,7 @@ class LitObject:
         """The scene as a dict, `size` pixels wide."""
         _, of, material = self.name.partition(" of ")
         if self.key in SCANS:
-            found = scan_scene(self.key, material, size, "small light" if self.light == "small light" else "even sky")
+            found = scan_scene(material, size, "small light" if self.light == "small light" else "even sky", self.key)
         elif of:
             found = self._shape(size, folder)
         else:

@@ -15,7 +15,7 @@ from benchmarks.long_runs import assessment_of
 from benchmarks.trade_tables import markdown, multiples, trade_table
 from figures.computing.contenders import OF_OBJECTS
 from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training_of, weight_files, with_weights
-from figures.computing.scans import BUNNY, MM_PER_UNIT, bunny_scene, prepare
+from figures.computing.scans import BUNNY, MM_PER_UNIT, prepare, scan_scene
 from figures.drawing.page import page
 from figures.drawing.trade_plot import image_shots
 from figures.parts.part import Params, Part, Result, SceneDict, Task
@@ -131,7 +131,7 @@ def turned(task: Task) -> dict[str, object]:
 
 def _scene(p: Params, folder: Path, medium: Medium | None = None) -> SceneDict:
     """The bunny, or what stands in its place at the same size; with a scalar medium instead of the material."""
-    scene = bunny_scene(p["material"], 512, LIGHTS[p["light"]])
+    scene = scan_scene(p["material"], 512, LIGHTS[p["light"]])
     if medium is not None:
         coefficients = {key: float(getattr(medium, key)) for key in ("sigma_s", "sigma_a", "g", "eta")}
         kept = {key: value for key, value in scene["bunny"]["bsdf"].items() if key != "material"}

@@ -11,7 +11,7 @@ import numpy as np
 
 from figures.computing.contenders import long_walk
 from figures.computing.images import FLIP, RELATIVE_MSE, compared
-from figures.computing.scans import BUNNY, bunny_scene, prepare
+from figures.computing.scans import BUNNY, prepare, scan_scene
 from figures.parts.part import Params, Part, Result, Row, Task
 from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.learning import online
@@ -199,7 +199,7 @@ class Snapshots:
 def _scene(p: Params, model: str) -> mi.Scene:
     from full_geometry.scenes.scene_files import open_scene
 
-    return open_scene(bunny_scene(p["material"], p["size"], p["lights"]), model)
+    return open_scene(scan_scene(p["material"], p["size"], p["lights"]), model)
 
 
 def trained_online(p: Params, folder: Path, seconds: float, train_seconds: float) -> dict[str, object]:

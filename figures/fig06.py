@@ -9,7 +9,7 @@ import numpy as np
 from figures.computing.images import Shot
 from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training_of, with_weights
 from figures.computing.references import NOTE, against, reference_image, reference_shot
-from figures.computing.scans import BUNNY, ENVIRONMENTS, bunny_scene, environment, environment_file, prepare
+from figures.computing.scans import BUNNY, ENVIRONMENTS, environment, environment_file, prepare, scan_scene
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
 from figures.parts.part import Part, Result, Task
@@ -70,7 +70,7 @@ def seen(task: Task) -> dict[str, object]:
 
     prepare()
     p = task.params
-    description = bunny_scene(MATERIAL, p["size"], EVEN if p["light"] == EVEN else "both")
+    description = scan_scene(MATERIAL, p["size"], EVEN if p["light"] == EVEN else "both")
     if p["light"] in ENVIRONMENTS:
         del description["lamp"]
         description["sky"] = environment(p["light"], p["scale"])

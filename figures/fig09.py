@@ -10,7 +10,7 @@ from figures.computing import contenders
 from figures.computing.images import Shot
 from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training_of, weight_files, with_weights
 from figures.computing.references import NOTE, against, long_reference, reference_shot
-from figures.computing.scans import BUNNY, MATERIALS, bunny_scene, prepare
+from figures.computing.scans import BUNNY, MATERIALS, prepare, scan_scene
 from figures.computing.timed import COMPILING, gathered_anew
 from figures.drawing.image_files import image_files, label
 from figures.parts.part import Part, Result, Task
@@ -61,7 +61,7 @@ def rendered(task: Task) -> dict[str, object]:
 
     prepare()
     p = task.params
-    description = bunny_scene(p["material"], p["size"], p["lights"])
+    description = scan_scene(p["material"], p["size"], p["lights"])
     description["integrator"] |= {key: p[key] for key in ("light", "entries") if key in p}
     with with_weights(task.folder, task.needed):
         scene = load_scene(description, p["model"])

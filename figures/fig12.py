@@ -12,7 +12,7 @@ import numpy as np
 from figures.computing.images import FLIP, Shot, compared, stops_of
 from figures.computing.learnt import shape_of
 from figures.computing.references import reference_image
-from figures.computing.scans import BUNNY, bunny_scene, prepare
+from figures.computing.scans import BUNNY, prepare, scan_scene
 from figures.drawing.image_files import image_files
 from figures.parts.part import Params, Part, Result, Task
 from halfspace_sss.neural.store import weights_in
@@ -99,7 +99,7 @@ def _scene(p: Params, light: str, entries: int = 1, gathering: str = "sampled") 
     """The bunny, orders from two on."""
     from full_geometry.scenes.scene_files import load_scene
 
-    description = bunny_scene("potato", p["size"], light)
+    description = scan_scene("potato", p["size"], light)
     description["integrator"] |= {"entries": entries, "light": gathering}
     description["bunny"]["bsdf"]["orders"] = "multiple"
     return load_scene(description, "full_geometry")

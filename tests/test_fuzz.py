@@ -34,7 +34,7 @@ COMPUTES = [  # what is replaced: the properties are of what comes before the co
     "halfspace_sss.neural.training.train_universal.train_universal",
     "halfspace_sss.comparison.truths.validate",
     "full_geometry.scenes.reference.render",
-    "halfspace_sss.comparison.model_truths.truths_cost", "figures.parts.runner.completed_plans",
+    "figures.parts.runner.completed_plans",
     "full_geometry.trade.flat.references", "full_geometry.trade.assessing.assess_stage",
     "full_geometry.trade.assessing.assess_for",
     "full_geometry.learning.shape_training._ShapeTraining", "full_geometry.learning.training._ObjectTraining",

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from figures.computing.learnt import SHAPES, object_parts
-from figures.computing.scans import BUNNY, bunny_scene, prepare
+from figures.computing.scans import BUNNY, prepare, scan_scene
 from figures.parts.part import Params, Part, Result, Task
 from halfspace_sss.comparison.style import TEXT, paper, saved
 from halfspace_sss.provenance import check_folder
@@ -83,7 +83,7 @@ def _lit(name: str, task: Task, resolution: int, seed: int) -> mi.Scene:
     if name == "candle":
         shown = object_parts("candle", resolution, check_folder(task.folder), seed)
         return open_scene({"type": "scene", "integrator": {"type": "bssrdf"}, **shown}, "neural")
-    return open_scene(bunny_scene("potato", 16, "small light"), "neural")
+    return open_scene(scan_scene("potato", 16, "small light"), "neural")
 
 
 def _light(obj: TranslucentObject, scene: mi.Scene, frame: ObjectFrame) -> tuple[np.ndarray, np.ndarray]:

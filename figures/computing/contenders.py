@@ -47,7 +47,7 @@ def contender(
     """
     from halfspace_sss import materials
 
-    description = scan_scene(scan, material, size, lights, sampler=sampler)
+    description = scan_scene(material, size, lights, scan, sampler)
     return ready(method, description, scan, materials.load(material).medium, bare)
 
 

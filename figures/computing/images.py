@@ -44,13 +44,13 @@ def cover(scene: mi.Scene, spp: int = GUIDE_SPP) -> np.ndarray:
     return _cover(_aovs(scene, "n:sh_normal", spp, 0))
 
 
-def guides(scene: mi.Scene, spp: int = GUIDE_SPP, sensor: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def guides(scene: mi.Scene, sensor: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Mean albedo of each pixel (H, W, 3) and mean shading normal (H, W, 3), both float32.
 
     The albedo of translucent objects is their directional albedo. Where there is none at all, as of mirrors and glass,
     it is the cover of the pixel, as Open Image Denoise asks.
     """
-    both = _aovs(scene, "albedo:albedo,n:sh_normal", spp, sensor)
+    both = _aovs(scene, "albedo:albedo,n:sh_normal", GUIDE_SPP, sensor)
     albedo, normal = np.clip(both[..., :3], 0, 1), both[..., 3:6]
     return np.where(albedo.any(axis=2, keepdims=True), albedo, _cover(normal)[..., None]), np.clip(normal, -1, 1)
 

@@ -22,22 +22,21 @@ from halfspace_sss.provenance import check_folder
 if TYPE_CHECKING:
     import mitsuba as mi
 
-SHAPES = ("bunny", "candle")
+SHAPES, CANDLE_RESOLUTION = ("bunny", "candle"), 96
 
 
-def shape_of(name: str, folder: Path, resolution: int = 96, seed: int = 0) -> tuple[mi.Shape, Medium, float]:
+def shape_of(name: str, folder: Path) -> tuple[mi.Shape, Medium, float]:
     """A Mitsuba shape, its medium and millimetres of a unit: the bunny of potato, or the candle of wax.
 
     Args:
         name: "bunny" or "candle".
         folder: where the mesh of the candle is written.
-        resolution, seed: of the candle.
     """
     import mitsuba as mi
 
     if name == "bunny":
         return mi.load_dict({"type": "ply", "filename": str(BUNNY)}), materials.load("potato").medium, MM_PER_UNIT
-    path = make_candle(resolution, seed).wax.write_ply(folder / "wax.ply")
+    path = make_candle(CANDLE_RESOLUTION).wax.write_ply(folder / "wax.ply")
     return mi.load_dict({"type": "ply", "filename": str(path)}), tissue("candle wax").medium, 1.0
 
 
@@ -71,51 +70,49 @@ CHUNKS = {"draft": 2, "paper": 8}  # of all figures, which share parts; seconds 
 GRID = 0.5  # cells of a medium along an object over cubes of its surface
 
 
-def train_scan(name: str, material: str, chunks: int, seed: int = 0, scan: str = "bunny") -> Part:
+def train_scan(name: str, material: str, chunks: int, scan: str = "bunny") -> Part:
     """The part in which a scanned object of a material is learnt by so many chunks of data.
 
     Args:
         name: of what is learnt, by which `training_of` finds it.
         material: in the registry.
         chunks: see `full_geometry.learning.training.train_unattended`.
-        seed: of the training.
-        scan: name in `scenes.SCANS`.
+        scan: name in `scans.SCANS`.
     """
-    params = {"scan": scan, "material": material, "chunks": chunks, "seed": seed, "model": FULL_GEOMETRY}
+    params = {"scan": scan, "material": material, "chunks": chunks, "seed": 0, "model": FULL_GEOMETRY}
     return Part(training_of(name), _scanned, params, chunks, inputs=(SCANS[scan].file,))
 
 
-def train_modelled(name: str, resolution: int, chunks: int, seed: int = 0) -> Part:
+def train_modelled(name: str, resolution: int, chunks: int) -> Part:
     """The part in which a modelled object is learnt.
 
     Args:
         name: a name in `modelling.objects.OBJECTS`.
         resolution: of its surface.
         chunks: as in `train_scan`.
-        seed: of the object and its training.
     """
-    params = {"object": name, "resolution": resolution, "chunks": chunks, "seed": seed, "model": FULL_GEOMETRY}
+    params = {"object": name, "resolution": resolution, "chunks": chunks, "seed": 0, "model": FULL_GEOMETRY}
     return Part(training_of(name), _modelled, params, chunks)
 
 
-def object_parts(name: str, resolution: int, folder: Path, seed: int = 0, model: str = "neural") -> SceneDict:
+def object_parts(name: str, resolution: int, folder: Path, seed: int = 0) -> SceneDict:
     """A modelled object with a smooth boundary, and what belongs to it, for a scene in mm.
 
     Args:
-        name, resolution, seed: as in `train_modelled`.
+        name, resolution: as in `train_modelled`.
         folder: for its files.
-        model: of light in it.
+        seed: of everything uneven about it.
     """
     if name == "candle":
-        return candle_parts(folder, resolution, seed, model)
+        return candle_parts(folder, resolution, seed)
     result = make_varying(name, resolution, max(round(GRID * resolution), 8), seed)
-    return learnable_parts(result, folder, model)
+    return learnable_parts(result, folder)
 
 
 def _scanned(task: Task) -> dict[str, object]:
     prepare()
     p = task.params
-    return trained(task, scan_scene(p["scan"], p["material"], 16, "even sky"), p["scan"])
+    return trained(task, scan_scene(p["material"], 16, "even sky", p["scan"]), p["scan"])
 
 
 def _modelled(task: Task) -> dict[str, object]:

@@ -52,25 +52,17 @@ def prepare() -> None:
     gc.collect()
 
 
-def bunny_scene(
-    material: str, size: int, lights: str = "both", model: str = "neural", sampler: str = "independent"
-) -> SceneDict:
-    """`scan_scene` of the bunny."""
-    return scan_scene("bunny", material, size, lights, model, sampler)
-
-
 def scan_scene(
-    scan: str, material: str, size: int, lights: str = "both", model: str = "neural", sampler: str = "independent"
+    material: str, size: int, lights: str = "both", scan: str = "bunny", sampler: str = "independent"
 ) -> SceneDict:
-    """A translucent object on its own, as a dict for `rendering.scene_files.load_scene`, under its name.
+    """A translucent object on its own, as a dict for `scenes.scene_files.load_scene`, under its name.
 
     Args:
-        scan: name in `SCANS`.
         material: name in the registry.
         size: pixels of the square image.
         lights: "both" for the small light and dim surroundings with two windows, "small light", or "even sky",
             radiance 1 from everywhere.
-        model: of the BSSRDF.
+        scan: name in `SCANS`.
         sampler: Mitsuba's plugin of random numbers; "multijitter" has less noise and takes square numbers of samples.
 
     Raises:
@@ -90,7 +82,7 @@ def scan_scene(
         scan: {
             "type": "ply",
             "filename": str(result.file),
-            "bsdf": {"type": "translucent", "material": material, "model": model},
+            "bsdf": {"type": "translucent", "material": material, "model": "neural"},
         },
     }
     if lights != "even sky":

@@ -156,17 +156,21 @@ def make_varying(name: str, resolution: int = 192, grid_resolution: int = 160, s
     return Varying(name, mesh, grid, ETA[name])
 
 
-def candle_parts(folder: Path, resolution: int = 192, seed: int = 0, model: str = "neural") -> SceneDict:
+def candle_parts(folder: Path, resolution: int = 192, seed: int = 0) -> SceneDict:
     """The candle: "candle" with the surface `translucent`, "wick", and "flame", an area light in the bowl; mm.
 
     Args:
         folder: where its PLY files are written.
         resolution, seed: as for `make_candle`.
-        model: of the BSSRDF.
     """
     made, wax = make_candle(resolution, seed), tissue("candle wax").medium
     files = {name: getattr(made, name).write_ply(Path(folder) / f"{name}.ply") for name in ("wax", "wick", "flame")}
-    surface = {"type": "translucent", "model": model, "g": 0.0, "eta": wax.eta}  # smooth, so that walks join the flame
+    surface = {
+        "type": "translucent",
+        "model": "neural",
+        "g": 0.0,
+        "eta": wax.eta,
+    }  # smooth, so that walks join the flame
     for key in ("sigma_s", "sigma_a"):
         surface[key] = ", ".join(f"{v:.9g}" for v in getattr(wax, key))
     black = {"type": "diffuse", "reflectance": 0.0}
@@ -179,15 +183,14 @@ def candle_parts(folder: Path, resolution: int = 192, seed: int = 0, model: str 
     }
 
 
-def learnable_parts(result: Varying, folder: Path, model: str = "full_geometry") -> SceneDict:
+def learnable_parts(result: Varying, folder: Path) -> SceneDict:
     """An object whose medium varies with the surface `translucent` and a smooth boundary, so that it can be learnt; mm.
 
     Args:
         result: the object.
         folder: where its PLY file and its grid volumes are written.
-        model: of light in it.
     """
     path = result.mesh.write_ply(Path(folder) / f"{result.name}.ply")
     grids = result.grid.write(Path(folder), result.name)
-    surface = {"type": "translucent", "model": model, "g": 0.0, "eta": result.eta, **grids}
+    surface = {"type": "translucent", "model": "neural", "g": 0.0, "eta": result.eta, **grids}
     return {result.name: {"type": "ply", "filename": str(path), "bsdf": surface}}

@@ -91,15 +91,14 @@ def errors_materials(
 
 def errors_truths(model: shared.Models = None, out: shared.OutFolder = Path("errors")) -> None:
     """Compare reflectances of models with published and exact values; an interrupted run goes on."""
-    from halfspace_sss.comparison.model_truths import reflectance_truths, truth_summary, truths_cost
+    from halfspace_sss.comparison.model_truths import reflectance_truths, truth_summary
     from halfspace_sss.provenance import KeptRows, check_folder, write_atomically
 
     check_models(model)
     check_folder(out)
     kept = KeptRows(out / "truths.part", {"what": "truths"})
-    before, (number, seconds) = len(kept), truths_cost(model or None, kept)
-    note = f", after {before} that were kept" if before else ""
-    shared.tell(f"{number} reflectances, about {max(seconds, 1):.0f} s{note}")
+    if kept:
+        shared.tell(f"goes on after {len(kept)} reflectances that were kept")
     with shared.Bar("truths") as bar:
         found = reflectance_truths(model or None, bar.told, kept)
     write_atomically(out / "truths.csv", shared.csv_of(found))

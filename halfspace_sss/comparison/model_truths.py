@@ -10,8 +10,7 @@ Veach and Guibas 1995).
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -19,7 +18,7 @@ import numpy as np
 from halfspace_sss.comparison.cell_energies import evaluated
 from halfspace_sss.comparison.truths import Truth, read_truths
 from halfspace_sss.interface.model import BSSRDF
-from halfspace_sss.measure.reflected_flux import DIFFUSE_COSINES, reflectance_estimate
+from halfspace_sss.measure.reflected_flux import reflectance_estimate
 from halfspace_sss.physics.fresnel import F_r
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.registry import bssrdf, models
@@ -164,27 +163,6 @@ def reflectance_truths(
     return pandas.DataFrame(rows)
 
 
-def truths_cost(names: Iterable[str] | None = None, kept: Container[str] = ()) -> tuple[int, float]:
-    """How many reflectances `reflectance_truths` has still to find, and about how many seconds that takes.
-
-    By one of each model, warm; light from everywhere is `DIFFUSE_COSINES` of them.
-    """
-    number, seconds = 0, 0.0
-    for name in models() if names is None else names:
-        asked = ((model, t) for t in _reflectances() if (model := _model(name, t)) is not None)
-        left = {key: one for one in asked if (key := _key(*one)) not in kept}
-        if not left:
-            continue
-        model, _ = next(iter(left.values()))
-        _reflectance(model, 1.0)
-        started = time.perf_counter()
-        _reflectance(model, 1.0)
-        each = time.perf_counter() - started
-        seconds += each * sum(DIFFUSE_COSINES if t.mu_i == "diffuse" else 1 for _, t in left.values())
-        number += len(left)
-    return number, seconds
-
-
 def _reflectances() -> list[Truth]:
     return [t for t in read_truths()[0] if t.measure in MEASURES and float(t.medium.albedo) > 0]
 
@@ -207,12 +185,12 @@ def _reflectance(model: BSSRDF, mu_i: float | str) -> list[float]:
     return [float(v) for v in reflectance_estimate(model, mu_i, "total")]
 
 
-def sampled_reflectance(model: BSSRDF, mu_i: float | str, seed: int = 0, points: int = POINTS) -> tuple[float, float]:
+def sampled_reflectance(model: BSSRDF, mu_i: float | str, points: int = POINTS) -> tuple[float, float]:
     """R(mu_i) = ∫∫ S mu_o dw_o dA of a scalar medium by quasi Monte Carlo (`exits`), and its error.
 
     mu_i is a cosine or "diffuse". The error is that of the mean of independent scrambles.
     """
-    values = exits(model, [mu_i] * REPEATS, points, (seed,)).flux.sum(axis=1)
+    values = exits(model, [mu_i] * REPEATS, points, (0,)).flux.sum(axis=1)
     return float(values.mean()), float(values.std(ddof=1) / math.sqrt(REPEATS))
 
 

@@ -147,7 +147,7 @@ def test_weights_of_another_training_are_not_found(small: None, tmp_path: Path) 
     from full_geometry.scenes.scene_files import load_scene
 
     scenes.prepare()
-    scene = scenes.bunny_scene("ketchup", 8)
+    scene = scenes.scan_scene("ketchup", 8)
     with learnt.with_weights(tmp_path, {}), pytest.raises(ValueError, match="must be trained for full_geometry"):
         load_scene(scene, MODEL)
 
