@@ -25,15 +25,11 @@ _held: set[tuple[Path, int]] = set()
 
 
 @contextlib.contextmanager
-def one_writer(path: Path, shared: bool = False) -> Iterator[None]:
+def one_writer(path: Path) -> Iterator[None]:
     """Hold the lock of a result, in `.NAME.lock` beside it, while it is written.
 
     The system lets go of the lock when a process ends, however it ends: a lock file that was left by one hinders
     nobody. What this thread holds already it may hold again. Object stores have no locks.
-
-    Args:
-        path: of the result.
-        shared: whether others that share it may write too, each what is its own.
 
     Raises:
         ValueError: another run writes it; the message names its process and computer.
@@ -47,14 +43,13 @@ def one_writer(path: Path, shared: bool = False) -> Iterator[None]:
     try:
         with naming(lock):
             lock.parent.mkdir(parents=True, exist_ok=True)
-            file = _taken(path, lock, shared)
+            file = _taken(path, lock)
         _held.add(key)
         try:
             yield
         finally:
             _held.discard(key)
-            with contextlib.suppress(OSError):  # others that share it, or Windows, keep the file
-                _take(file, shared=False)
+            with contextlib.suppress(OSError):  # Windows keeps the file
                 lock.unlink()
             file.close()
     finally:
@@ -63,12 +58,12 @@ def one_writer(path: Path, shared: bool = False) -> Iterator[None]:
                 folder.rmdir()
 
 
-def _taken(path: Path, lock: Path, shared: bool) -> IO[str]:
+def _taken(path: Path, lock: Path) -> IO[str]:
     """The open lock file, which names this process."""
     while True:
         file = lock.open("a+", encoding="utf-8")
         try:
-            _take(file, shared)
+            _take(file)
         except OSError as error:
             if error.errno not in HELD_BY_OTHERS:
                 file.close()
@@ -95,17 +90,16 @@ def _taken(path: Path, lock: Path, shared: bool) -> IO[str]:
         file.close()
 
 
-def _take(file: IO[str], shared: bool) -> None:
+def _take(file: IO[str]) -> None:
     """Lock an open file; OSError if another holds it."""
     if fcntl is None:
         import msvcrt
 
         file.seek(2**20)  # beyond the text, which others read
-        if not shared:
-            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
         return
     try:
-        fcntl.flock(file.fileno(), (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+        fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         if error.errno not in NO_LOCKS:
             raise

@@ -26,7 +26,7 @@ import sys
 from pathlib import Path
 from halfspace_sss.locks import one_writer
 
-with one_writer(Path(sys.argv[1]), shared=sys.argv[2:] == ["shared"]):
+with one_writer(Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.read()
 """
@@ -34,8 +34,8 @@ GRID, MEDIUM = MapGrid(2, 16, 8, 4), Medium.from_albedo(0.5, 1.0)
 
 
 @contextmanager
-def _held(path: Path, *shared: str) -> Iterator[subprocess.Popen]:
-    command = [sys.executable, "-c", HOLD, str(path), *shared]
+def _held(path: Path) -> Iterator[subprocess.Popen]:
+    command = [sys.executable, "-c", HOLD, str(path)]
     run = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     try:
         assert run.stdout.readline() == "held\n"
@@ -44,8 +44,8 @@ def _held(path: Path, *shared: str) -> Iterator[subprocess.Popen]:
         run.communicate("")
 
 
-def _maps(folder: Path, **how: object) -> Path:
-    return make_maps({"a": MEDIUM}, folder, grid=GRID, target_error=None, n_paths=1024, **how)["a"]
+def _maps(folder: Path) -> Path:
+    return make_maps({"a": MEDIUM}, folder, grid=GRID, target_error=None, n_paths=1024)["a"]
 
 
 def test_the_second_writer_is_told_who_the_first_is(tmp_path: Path) -> None:
@@ -88,16 +88,6 @@ def test_a_thread_may_lock_again_what_it_holds_and_another_thread_may_not(tmp_pa
     assert len(found) == 1
 
 
-def test_many_may_share_a_lock_and_none_may_have_it_alone_then(tmp_path: Path) -> None:
-    with _held(tmp_path / "x", "shared"):
-        with one_writer(tmp_path / "x", shared=True):
-            pass
-        with pytest.raises(ValueError, match="one run at a time"):
-            with one_writer(tmp_path / "x"):
-                pass
-    assert not list(tmp_path.iterdir())
-
-
 def test_one_lock_of_many_that_come_at_once_is_given(tmp_path: Path) -> None:
     inside, most, refused = [0], [0], [0]
 
@@ -131,14 +121,8 @@ def test_a_render_beside_another_of_the_same_name_is_refused_and_changes_nothing
         assert sorted(out.iterdir()) == before
 
 
-def test_maps_beside_others_of_the_same_name_are_refused_and_shares_are_not(tmp_path: Path) -> None:
+def test_maps_beside_others_of_the_same_name_are_refused(tmp_path: Path) -> None:
     with _held(tmp_path / "a.zarr"), pytest.raises(ValueError, match="must be written by one run at a time"):
         _maps(tmp_path)
-    with _held(tmp_path / "a.zarr", "shared"):
-        _maps(tmp_path, share=(0, 2))
-        with pytest.raises(ValueError, match="must be written by one run at a time"):
-            _maps(tmp_path)
-    with _held(tmp_path / "a.zarr.1-of-2"), pytest.raises(ValueError, match="must be written by one run at a time"):
-        _maps(tmp_path, share=(1, 2))
-    load_maps(_maps(tmp_path, share=(1, 2)))
+    load_maps(_maps(tmp_path))
     assert [path.name for path in tmp_path.iterdir()] == ["a.zarr"]

@@ -54,7 +54,6 @@ def maps(
     name: Annotated[
         str | None, typer.Option(help="Name of the store of a medium given by coefficients.", show_default="medium")
     ] = None,
-    share: Annotated[str, typer.Option(help="k/n: of n processes that fill one folder, this is number k < n.")] = "0/1",
     out: Annotated[
         Path,
         typer.Option(
@@ -75,26 +74,14 @@ def maps(
         raise ValueError("name must have a letter at least, got ''")
     media = {re.sub(r"[^\w.-]+", "_", title) if name is None else name: medium for title, medium in media.items()}
     target = TARGET_ERROR if tracing.target_error is None and tracing.paths is None else tracing.target_error
-    part = _share(share)
     check_folder(out)
     with places.executor() as executor, shared.Bar("tracing") as bar:
         stores = make_maps(
             media, out, grid=_grid(tracing.grid), target_error=target, n_paths=tracing.paths, seed=tracing.seed,
-            backend=tracing.backend, share=part, progress=bar.show, executor=executor,
+            backend=tracing.backend, progress=bar.show, executor=executor,
         )  # fmt: skip
-    if part[1] > 1:
-        shared.say(f"share {part[0]}/{part[1]} is done; the stores are whole when all {part[1]} shares are:")
-    else:
-        shared.say(_table(stores))
+    shared.say(_table(stores))
     shared.say_files(stores.values())
-
-
-def _share(text: str) -> tuple[int, int]:
-    try:
-        k, n = (int(part) for part in text.split("/"))
-    except ValueError:
-        raise ValueError(f"share must be k/n with 0 <= k < n, got {text!r}") from None
-    return k, n
 
 
 def _grid(text: str) -> MapGrid:

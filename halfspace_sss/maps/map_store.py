@@ -132,7 +132,6 @@ def make_maps(
     n_paths: int | None = None,
     seed: int = 0,
     backend: str = "llvm",
-    share: tuple[int, int] = (0, 1),
     progress: ProgressText | None = None,
     executor: Executor | None = None,
 ) -> dict[str, Path]:
@@ -141,7 +140,7 @@ def make_maps(
     For each of n_theta directions of incidence and each of n_phi azimuths (which follow from the first by
     rotation, so the walks are shared) a map holds S of order >= 2 towards its own direction of observation,
     over cells of x_o - x_i. One direction of incidence of one channel is one unit of work: its result depends on
-    the arguments alone, so a killed and resumed run equals an unbroken one bit for bit, and units can be shared.
+    the arguments alone, so a killed and resumed run equals an unbroken one bit for bit, wherever units are traced.
 
     Args:
         media: name -> medium; channels of a medium become a dimension of its store.
@@ -150,7 +149,6 @@ def make_maps(
         target_error: stop a unit at this mean cell error (see `trace_unit`); None to trace `n_paths` exactly.
         n_paths: walks per unit and group of 16 observations; with a target error, the most that are traced.
         seed, backend: as in `trace`.
-        share: (k, n) does every n-th unit from the k-th on, so that n processes can fill one folder together.
         progress: called with (units done, units in all, what was just done), first with those that were done before.
         executor: where units are traced and written (see `halfspace_sss.executors`); by default in this process.
 
@@ -162,16 +160,14 @@ def make_maps(
             has been written then. Or a unit of a store is damaged; nothing has been traced then.
     """
     grid = grid or MapGrid()
-    _check(media, target_error, n_paths, seed, share)
+    _check(media, target_error, n_paths, seed)
     array_types(backend)
     paths = {name: path_of(folder) / f"{name}.zarr" for name in media}
     asked = {name: _parameters(m, grid, target_error, n_paths, seed, backend) for name, m in media.items()}
-    units = _units(media, grid, target_error, n_paths or MOST_PATHS, seed, backend)[share[0] :: share[1]]
+    units = _units(media, grid, target_error, n_paths or MOST_PATHS, seed, backend)
     with contextlib.ExitStack() as locks:
         for path in paths.values():
-            locks.enter_context(one_writer(path, shared=share[1] > 1))
-            if share[1] > 1:
-                locks.enter_context(one_writer(path.with_name(f"{path.name}.{share[0]}-of-{share[1]}")))
+            locks.enter_context(one_writer(path))
         _create_missing(media, paths, asked, units, grid, seed)
         _trace_missing(paths, asked, units, progress, executor)
     return paths
@@ -218,7 +214,7 @@ def _trace_missing(
 def _units(
     media: Mapping[str, Medium], grid: MapGrid, target_error: float | None, n_paths: int, seed: int, backend: str
 ) -> list[Unit]:
-    """Name, channel and work of every unit, in the order of the shares."""
+    """Name, channel and work of every unit."""
     stop = {"target_error": target_error, "n_paths": n_paths, "backend": backend}
     return [
         (name, channel, MapUnit(mfp, grid, a, seed, stream=channel, **stop))
@@ -229,7 +225,7 @@ def _units(
     ]
 
 
-def _check(media: object, target_error: object, n_paths: object, seed: object, share: object) -> None:
+def _check(media: object, target_error: object, n_paths: object, seed: object) -> None:
     if not isinstance(media, Mapping) or not media:
         raise ValueError(f"media must map at least one name to a Medium, got {media!r}")
     for name, medium in media.items():
@@ -244,8 +240,6 @@ def _check(media: object, target_error: object, n_paths: object, seed: object, s
     if n_paths is not None:
         check_count("n_paths", n_paths, 1024)
     check_count("seed", seed, 0)
-    if len(share) != 2 or not 0 <= share[0] < share[1]:
-        raise ValueError(f"share must be (k, n) with 0 <= k < n, got {share!r}")
 
 
 def _parameters(
@@ -313,9 +307,6 @@ def _create(path: Path, medium: Medium, grid: MapGrid, seed: int, asked: JsonDic
                 (temporary / key).parent.mkdir(parents=True, exist_ok=True)
                 (temporary / key).write_bytes(data)
             os.replace(temporary, path)
-    except OSError:
-        if not path.exists():  # else another process, with another share, was first
-            raise
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 

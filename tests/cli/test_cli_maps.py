@@ -58,11 +58,8 @@ def test_progress_goes_to_stderr(tmp_path: Path) -> None:
     assert "tracing" in result.stderr and "tracing" not in result.stdout
 
 
-def test_shares_fill_a_store_that_the_last_call_only_checks(tmp_path: Path, monkeypatch: Any) -> None:
-    for share in ("0/2", "1/2"):
-        result = _invoke(*SMALL, "--share", share, "--out", str(tmp_path))
-        assert result.exit_code == 0
-        assert f"share {share} is done" in result.stdout
+def test_a_store_that_is_whole_is_only_checked(tmp_path: Path, monkeypatch: Any) -> None:
+    assert _invoke(*SMALL, "--out", str(tmp_path)).exit_code == 0
     monkeypatch.setattr("halfspace_sss.maps.map_store.trace_unit", None)
     result = _invoke(*SMALL, "--out", str(tmp_path))
     assert result.exit_code == 0
@@ -93,8 +90,6 @@ def test_a_store_of_other_parameters_is_refused_and_nothing_added(tmp_path: Path
         (["--grid", "16,64"], "grid must be four whole numbers separated by commas, got '16,64'"),
         (["--grid", "16,64,inf,8"], "grid must be four whole numbers separated by commas, got '16,64,inf,8'"),
         (["--grid", "16,20,8,8"], "n_phi must be a multiple of 16, got 20"),
-        (["--share", "1"], "share must be k/n with 0 <= k < n, got '1'"),
-        (["--share", "2/2"], "share must be (k, n) with 0 <= k < n, got (2, 2)"),
         (["--target-error", "0"], "target_error must be a number in [0.0001, 1], got 0.0"),
         (["--paths", "5"], "n_paths must be a whole number >= 1024, got 5"),
         (["--seed", "-1"], "seed must be a whole number >= 0, got -1"),

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from halfspace_sss import Medium, make_maps, trace
+from halfspace_sss.maps import map_store
 from halfspace_sss.maps.grid import MapGrid, cell_edges, map_directions, radial_scale
-from halfspace_sss.maps.map_store import _template, load_maps
+from halfspace_sss.maps.map_store import load_maps
 from halfspace_sss.maps.map_tracing import MapUnit, trace_unit
 from halfspace_sss.tracing.tracer import Line, trace_curve
 
@@ -98,14 +99,6 @@ def test_a_store_has_a_channel_for_each_of_a_medium(tmp_path):
     assert np.isfinite(maps.S).all()
 
 
-def test_shares_fill_one_store_together(tmp_path):
-    arguments = {"grid": SMALL, "target_error": None, "n_paths": 2048}
-    whole = make_maps({"m": FIG10}, tmp_path / "whole", **arguments)
-    for k in range(2):
-        paths = make_maps({"m": FIG10}, tmp_path / "parts", share=(k, 2), **arguments)
-    assert load_maps(paths["m"]).S.equals(load_maps(whole["m"]).S)
-
-
 SCRIPT = """
 from halfspace_sss import Medium, make_maps
 from halfspace_sss.maps.grid import MapGrid
@@ -135,25 +128,21 @@ def test_a_killed_run_resumes_to_the_same_bits(tmp_path):
         assert a[name].values.tobytes() == b[name].values.tobytes(), name
 
 
-def test_progress_begins_with_the_units_that_were_done_before(tmp_path):
+def test_progress_begins_with_the_units_that_were_done_before(tmp_path, monkeypatch):
     arguments = {"grid": SMALL, "target_error": None, "n_paths": 1024}
-    calls = []
-    make_maps({"m": FIG10}, tmp_path, share=(1, 2), **arguments)
+    calls, found = [], map_store.trace_unit
+
+    def interrupted(unit):
+        if unit.theta_index == 1:
+            raise KeyboardInterrupt
+        return found(unit)
+
+    monkeypatch.setattr(map_store, "trace_unit", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        make_maps({"m": FIG10}, tmp_path, **arguments)
+    monkeypatch.undo()
     make_maps({"m": FIG10}, tmp_path, progress=lambda *call: calls.append(call), **arguments)
-    assert calls == [(1, 3, ""), (2, 3, "m channel 0 direction 1/3"), (3, 3, "m channel 0 direction 3/3")]
-
-
-def test_a_process_that_makes_the_store_second_takes_that_of_the_first(store, monkeypatch):
-    of_the_first = store.rename(store.with_name("elsewhere"))
-
-    def template(*arguments):
-        of_the_first.rename(store)
-        return _template(*arguments)
-
-    monkeypatch.setattr("halfspace_sss.maps.map_store._template", template)
-    make_maps({"m": FIG10}, store.parent, grid=SMALL, target_error=None, n_paths=1024)
-    assert [path.name for path in store.parent.iterdir()] == ["m.zarr"]
-    load_maps(store)
+    assert calls == [(1, 3, ""), (2, 3, "m channel 0 direction 2/3"), (3, 3, "m channel 0 direction 3/3")]
 
 
 @pytest.fixture
@@ -212,7 +201,6 @@ def test_a_store_of_another_run_is_refused_by_parameter(store):
         ({"target_error": None}, "target_error or n_paths must be given"),
         ({"n_paths": 10}, "n_paths must be a whole number >= 1024, got 10"),
         ({"seed": -1}, "seed must be a whole number >= 0, got -1"),
-        ({"share": (2, 2)}, r"share must be \(k, n\) with 0 <= k < n, got \(2, 2\)"),
         ({"backend": "metal"}, "backend must be one of llvm, cuda, got 'metal'"),
     ],
 )
