@@ -21,7 +21,7 @@ from halfspace_sss.checks import check_choice, check_interval
 from halfspace_sss.progress import Progress
 
 QUALITIES = ("draft", "paper")
-COMPUTING = ("analytic_models", "figures.computing", "figures.modelling", "full_geometry", "halfspace_sss")
+COMPUTING = ("analytic_models", "figures/computing", "figures/modelling", "full_geometry", "halfspace_sss")
 Params = Mapping[str, Any]  # parameters, or numbers, of a part
 Row = dict[str, float | str | None]  # of a table
 SceneDict = dict[str, Any]  # a scene, or a part of it, as `mitsuba.load_dict` takes it
@@ -168,9 +168,9 @@ def code_hash(function: Function) -> str:
 
 @functools.cache
 def _package_hash(name: str) -> str:
-    """Of the files of a package, or of nothing for a module that is in none."""
-    digest = hashlib.sha256()
-    for folder in map(Path, getattr(importlib.import_module(name), "__path__", ())):
+    """Of the files of a package, or of a room of it; of nothing for a module that is in none."""
+    digest, (package, _, room) = hashlib.sha256(), name.partition("/")
+    for folder in (Path(each) / room for each in getattr(importlib.import_module(package), "__path__", ())):
         for path in sorted(folder.rglob("*.py")):
             if "cli" not in path.relative_to(folder).parts:
                 digest.update(path.read_bytes())

@@ -190,7 +190,7 @@ class Interrupting:
             os.kill(os.getpid(), signal.SIGINT)
 sys.meta_path.insert(0, Interrupting())
 """
-FIRST = ("backend", "lazy", "cli", "cli.interrupts", "cli.shared")
+FIRST = ("backend", "lazy", "cli", "interrupts", "cli.shared")
 
 
 @pytest.mark.parametrize("module", [f"halfspace_sss.{name}" for name in FIRST] + ["typer"])
