@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from full_geometry.trade.results import ObjectTrade, TechniqueTrade
 
 SHIPPED = "trade.csv"  # in the package: three materials, two shapes, two lights
-HEADINGS = ("way", "bias, %", "variance", "s a million", "cost")
+HEADINGS = ("technique", "bias, %", "variance", "s a million", "cost")
 
 
 @dataclass(frozen=True)
