@@ -15,7 +15,6 @@ from figures.computing.scans import BUNNY, prepare, scan_scene
 from figures.parts.part import Params, Part, Result, Row, Task
 from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.learning import online
-from full_geometry.learning.online import combined
 from full_geometry.scenes import reference
 from full_geometry.scenes.reference_store import Reference
 from full_geometry.trade.image_differences import srgb
@@ -224,11 +223,12 @@ def trained_online(p: Params, folder: Path, seconds: float, train_seconds: float
         if not switch[0]:
             switch[0] = result.seconds - image.seconds
             result.add(walks[0], last=True)
-        result.add(combined(walks[0], image))
+        result.add(online.combined(walks[0], image))
 
     image = online.render(
         _scene(p, p["model"]), folder / "online.exr", train_seconds=train_seconds, train_error=p["train_error"],
-        seed=p["seed"], walked=traced, progress=rendered, seconds=max(seconds - train_seconds, 0.1), interval=1e9,
+        seed=p["seed"], listeners=online.Listeners(rendered, traced), seconds=max(seconds - train_seconds, 0.1),
+        interval=1e9,
     )  # fmt: skip
     result.add(image, last=True)
     return {"snapshots": result, "switch": switch[0], "training": image.about["training"]}

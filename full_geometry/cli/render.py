@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
     import numpy as np
 
+    from full_geometry.learning.online import Listeners
     from full_geometry.scenes.reference import Limits
     from full_geometry.scenes.reference_store import Picture, Reference
 
@@ -222,7 +223,7 @@ def _rendered(scene: mi.Scene, file: Path, limits: Limits, which: dict[str, Any]
     start = file if resume and file.exists() and not begun else resume
     with bars:
         try:
-            return online.render(scene, part, resume=start, **which, **vars(limits), **bars.callbacks())
+            return online.render(scene, part, resume=start, **which, **vars(limits), listeners=bars.listeners())
         except RuntimeError as error:
             raise BackendError(first_cause(error)) from error
         except KeyboardInterrupt:
@@ -241,9 +242,11 @@ class _Bars:
     def __exit__(self, *error: object) -> None:
         self.bar.__exit__(*error)
 
-    def callbacks(self) -> dict[str, Any]:
+    def listeners(self) -> Listeners:
         """What `online.render` is to call."""
-        return {"progress": self._rendered, "learning": self._learnt, "told": self._told}
+        from full_geometry.learning.online import Listeners
+
+        return Listeners(self._rendered, None, self._learnt, self._told)
 
     def kept(self, part: Path) -> str:
         """What an interrupt leaves."""

@@ -15,7 +15,7 @@ import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import mitsuba as mi
 import numpy as np
@@ -34,6 +34,21 @@ from halfspace_sss.provenance import check_folder
 
 TRAINING = "training"
 TRAIN_ERROR = 0.03
+
+
+class Listeners(NamedTuple):
+    """What is called on the way, if anything.
+
+    Args:
+        rendered, walked: after each pass of the model, and of walks, with the image.
+        learnt: with (what, done, total) while an object is learnt.
+        told: with a sentence before an object is learnt.
+    """
+
+    rendered: reference.Progress | None = None
+    walked: reference.Progress | None = None
+    learnt: NamedProgress | None = None
+    told: Callable[[str], None] = lambda sentence: None
 
 
 def files(path: Path) -> dict[str, Path]:
@@ -66,10 +81,7 @@ def render(
     sensor: int = 0,
     seed: int = 0,
     resume: bool | str | os.PathLike = True,
-    progress: reference.Progress | None = None,
-    walked: reference.Progress | None = None,
-    learning: NamedProgress | None = None,
-    told: Callable[[str], None] | None = None,
+    listeners: Listeners = Listeners(),  # noqa: B008
     **limits: Any,
 ) -> Reference:
     """`reference.render`, before which objects without weights are learnt from walks that join the image.
@@ -86,10 +98,7 @@ def render(
         sensor: number of the sensor.
         seed: of walks, learning and render.
         resume: True goes on with what is at `path`, False begins anew, another path goes on with what is there.
-        progress: called after each pass of the model, with its image.
-        walked: called after each pass of walks, with theirs.
-        learning: called with (what, done, total) while an object is learnt.
-        told: called with a sentence before an object is learnt.
+        listeners: what is called on the way.
         limits: fields of `reference.Limits`.
 
     Returns:
@@ -112,19 +121,19 @@ def render(
     elif base != path:
         _fetch(files(base), parts)
     names = untrained(scene) if train_seconds > 0 else {}
-    how = {"sensor": sensor, "seed": seed, "progress": progress, **limits}
+    how = {"sensor": sensor, "seed": seed, "progress": listeners.rendered, **limits}
     if not names and not parts["walks.exr"].exists():
         if is_bssrdf(integrator):
             integrator.prepare(scene)  # here, because Mitsuba wraps what is refused while it renders
         return reference.render(scene, path, resume=resume, **how)
-    walks = CameraWalks(scene, integrator.settings, sensor, seed, parts["walks.exr"], about, walked)
+    walks = CameraWalks(scene, integrator.settings, sensor, seed, parts["walks.exr"], about, listeners.walked)
     if walks.found is not None:
         reference.check_same(walks.found, parts["walks.exr"], about)
     if names:
         walks.check()
         integrator.check(scene, [name for ids in names.values() for name in ids])
     enough = {"seconds": train_seconds, "target_error": train_error, "seed": seed}
-    records = _learnt(scene, walks, enough, parts["training"], learning, told or (lambda sentence: None))
+    records = _learnt(scene, walks, enough, parts["training"], listeners)
     integrator.prepare(scene)
     if walks.found is None:
         result = reference.render(scene, path, resume=resume, **how)
@@ -139,19 +148,18 @@ def render(
 
 
 def _learnt(
-    scene: mi.Scene, walks: CameraWalks, enough: dict[str, Any], work: Path, learning: NamedProgress | None,
-    told: Callable[[str], None],
-) -> list[dict[str, Any]]:  # fmt: skip
+    scene: mi.Scene, walks: CameraWalks, enough: dict[str, Any], work: Path, listeners: Listeners
+) -> list[dict[str, Any]]:
     """Learn one object after the other; those of the same mesh and medium share what was learnt."""
     camera, records = walks if _join(scene) else None, []
     while enough["seconds"] > 0 and (names := untrained(scene)):
         model, (name, *_) = next(iter(names.items()))
         if any(name == record["object"] for record in records):
             raise ValueError(f"weights of object {name!r} must be found once they are written, got none")
-        told(_sentence(name, model, enough, camera is not None))
+        listeners.told(_sentence(name, model, enough, camera is not None))
         result = learner(model).train(
             scene, object=name, **enough, folder=None, work=work / f"{zlib.crc32(name.encode()):08x}",
-            progress=learning, camera=camera,
+            progress=listeners.learnt, camera=camera,
         )  # fmt: skip
         records.append(_record(result, model))
         if walks.found is not None:

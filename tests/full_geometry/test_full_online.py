@@ -309,6 +309,6 @@ def test_the_combination_of_two_images_is_not_biased_and_has_less_variance_than_
 def test_the_library_function_renders_what_the_command_does(whole: Path) -> None:
     said: list[str] = []
     IMAGE.parent.mkdir()
-    online.render("ball.xml", IMAGE, train_seconds=60.0, spp=8, told=said.append)
+    online.render("ball.xml", IMAGE, train_seconds=60.0, spp=8, listeners=online.Listeners(told=said.append))
     assert len(said) == 1
     _same_image(whole)
