@@ -28,7 +28,6 @@ from full_geometry.geometry.points import (
     cosine_above,
     lifted,
     opaque,
-    turned,
 )
 from full_geometry.geometry.shape import Geometry
 
@@ -41,11 +40,7 @@ REACH = 2.0  # h over the mean distance of points
 MOST_CELLS = 2**22
 LIKE = 0.2  # difference of logarithms of colours that are blended
 GOLDEN = 0.6180339887498949
-R_3 = (
-    0.8191725133961645,
-    0.6710436067037893,
-    0.5497004779019703,
-)  # of three dimensions (Roberts 2018)
+R_3 = (0.8191725133961645, 0.6710436067037893, 0.5497004779019703)  # of three dimensions (Roberts 2018)
 
 
 def lattice(count: int, roots: Sequence[float] = R_3, shift: Sequence[float] = (0.5, 0.5, 0.5)) -> list[np.ndarray]:
@@ -57,9 +52,7 @@ def uniform_entries(geometry: Geometry, u_face: mi.Float, u: mi.Point2f) -> Entr
     """Points uniform over the area of an object."""
     at = AreaPoints(geometry.shape).sample(u_face, u, mi.Bool(True))
     face = mi.UInt32(at.prim_index) + dr.zeros(mi.UInt32, dr.width(u))
-    sign = geometry.side(face)
-    n_out = mi.Normal3f(turned(mi.Normal3f(at.n_shading), mi.Normal3f(at.n))) * sign
-    n = mi.Normal3f(at.n) * sign
+    n, n_out = at.outward(geometry.side(face))
     return EntrySample(mi.Point3f(at.p), n, mi.Normal3f(n_out), opaque(geometry.area), face)
 
 

@@ -612,6 +612,10 @@ class Point(NamedTuple):
     n_shading: mi.Normal3f
     prim_index: mi.UInt32
 
+    def outward(self, sign: mi.Float | float) -> tuple[mi.Normal3f, mi.Normal3f]:
+        """Geometric and shading normal on the outer side, by the sign that turns the former there."""
+        return mi.Normal3f(self.n * sign), mi.Normal3f(turned(self.n_shading, self.n) * sign)
+
 
 class AreaPoints:
     """Uniform points of a shape; for a mesh by its faces, as Mitsuba gives one of the two normals only.

@@ -251,6 +251,11 @@ class Geometry:
             ray if self.transform is None else self.transform.ray_to_object(ray), coherent, active
         )
 
+    def ray_onto(self, p: mi.Point3f, n: mi.Normal3f) -> tuple[mi.Ray3f, mi.Float]:
+        """A short ray onto the surface at a point with its outward normal, and how far that is."""
+        off = dr.maximum(10 * self.clearance, dr.opaque(mi.Float, 1e-5 * self.size))
+        return mi.Ray3f(mi.Point3f(p + n * off), mi.Vector3f(-n)), off
+
     @property
     def upright(self) -> bool:
         """Whether every normal points outwards."""

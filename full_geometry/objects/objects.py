@@ -37,7 +37,6 @@ from full_geometry.geometry.points import (
     cosine_direction,
     opaque,
     surface_point,
-    turned,
 )
 from full_geometry.geometry.shape import (
     Geometry,
@@ -323,9 +322,8 @@ class TranslucentObject:
         """Points uniform over the area, seen along geometric normals: `n_out` is the interpolated one itself."""
         u_face, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
         at = self.points.sample(u_face, u, True)
-        n = at.n * self.geometry.sign
-        result = surface_point(at.p, n, turned(at.n_shading, at.n) * self.geometry.sign, n)
-        return self.knowing(result, mi.UInt32(at.prim_index))
+        n, n_out = at.outward(self.geometry.sign)
+        return self.knowing(surface_point(at.p, n, n_out, n), mi.UInt32(at.prim_index))
 
     def random_points(self, rng: mi.PCG32) -> SurfacePoint:
         """Points uniform over the area, directions by the cosine to the shading normal, one for each lane of rng."""

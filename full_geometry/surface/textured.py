@@ -267,8 +267,7 @@ def _interaction(
     if obj.transform is not None:
         p, n, obj = obj.transform.point_to_object(p), obj.transform.normal_to_object(n), replace(obj, transform=None)
     if face is None or not obj.shape.is_mesh():
-        off = dr.maximum(10 * obj.clearance, opaque(1e-5 * obj.size))
-        ray = mi.Ray3f(mi.Point3f(p + n * off), mi.Vector3f(-n))
+        ray, off = obj.ray_onto(p, n)
         if obj.shape.class_name() == "Sphere":  # which knows its uv without a search
             met = dr.zeros(mi.PreliminaryIntersection3f, dr.width(p))
             met.t, met.shape = off, mi.ShapePtr(obj.shape)

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import drjit as dr
 import mitsuba as mi
 
-from full_geometry.geometry.points import EntrySample, opaque, turned
+from full_geometry.geometry.points import EntrySample, turned
 from full_geometry.geometry.shape import Geometry, name_of
 from full_geometry.geometry.snapshot import held
 from full_geometry.surface.translucent import is_translucent
@@ -112,9 +112,7 @@ class Wrapping:
         """The entry with the bent normal, looked up where a short ray meets the object."""
         if self.bend is None:
             return entry
-        off = dr.maximum(10 * obj.clearance, opaque(1e-5 * obj.size))
-        ray = mi.Ray3f(mi.Point3f(entry.p + entry.n * off), mi.Vector3f(-entry.n))
-        si = obj.ray_intersect(ray, mi.RayFlags.All, False, active)
+        si = obj.ray_intersect(obj.ray_onto(entry.p, entry.n)[0], mi.RayFlags.All, False, active)
         n = turned(self.bent(si, active & si.is_valid()).sh_frame.n, entry.n)
         return entry._replace(n_out=mi.Normal3f(dr.select(si.is_valid(), n, entry.n_out)))
 

@@ -31,7 +31,6 @@ from full_geometry.geometry.points import (
     cosine_direction,
     opaque,
     surface_point,
-    turned,
 )
 from full_geometry.objects.objects import TranslucentObject
 from full_geometry.transport.features import ObjectFrame, PreparedExit, Side, first_event, side_features
@@ -265,8 +264,7 @@ class PatchTable:
             u_face, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
             cell = dr.arange(mi.UInt32, n)
             at = obj.points.on_face(cell, u) if n == len(of_face) else parts.point(cell, u_face, u)
-            n_out = mi.Normal3f(turned(at.n_shading, at.n) * obj.geometry.sign)
-            normal = mi.Normal3f(at.n * obj.geometry.sign)
+            normal, n_out = at.outward(obj.geometry.sign)
             exit = surface_point(at.p, normal, n_out, cosine_direction(n_out, normal, rng))
             exit = obj.knowing(exit, mi.UInt32(at.prim_index))
             total = total + _weights(sampler, Side(exit, first_event(obj, exit)), n)
@@ -351,9 +349,8 @@ class LearntProposals(CosineProposals):
         by_patch = active & (sampler.next_1d() < opaque(self.patch_share))
         weights = prepared.weights if self.table is None else self.table.weights(prim_index)
         at, _ = self.patches.sample(weights, sampler.next_1d(), sampler.next_1d(), sampler.next_2d())
-        n_out = turned(at.n_shading, at.n) * opaque(self.sign)
-        n = mi.Normal3f(at.n * opaque(self.sign))
-        entry = EntrySample(mi.Point3f(at.p), n, mi.Normal3f(n_out), mi.Float(1), mi.UInt32(at.prim_index))
+        n, n_out = at.outward(opaque(self.sign))
+        entry = EntrySample(mi.Point3f(at.p), n, n_out, mi.Float(1), mi.UInt32(at.prim_index))
         if self.patch_share < 1:
             probed = self.positions.sample(out, prim_index, sampler, active & ~by_patch)
             entry = EntrySample(*(dr.select(by_patch, a, b) for a, b in zip(entry[:5], probed)))
