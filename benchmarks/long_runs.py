@@ -12,9 +12,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from full_geometry.geometry.sensors import seeded
 from full_geometry.trade.assessing import assess_stage
 from full_geometry.trade.results import Assessment, ObjectTrade, TechniqueTrade
-from full_geometry.trade.statistics import seeded
 from full_geometry.trade.techniques import Effort, Stage, Technique
 from halfspace_sss.provenance import provenance, write_atomically
 

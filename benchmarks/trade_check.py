@@ -8,12 +8,12 @@ from pathlib import Path
 
 from benchmarks.long_runs import assessment_of, long_run
 from benchmarks.random_scenes import RandomScene, write_scene
+from full_geometry.geometry.sensors import seeded
 from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.trade.advice import advise
 from full_geometry.trade.assessing import assess_for, learn
 from full_geometry.trade.automatic import picked
 from full_geometry.trade.results import TechniqueTrade
-from full_geometry.trade.statistics import seeded
 from full_geometry.trade.techniques import Effort, Job, Stage, Technique, stage
 from halfspace_sss.neural.store import weights_in
 from halfspace_sss.provenance import provenance, write_atomically

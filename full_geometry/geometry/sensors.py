@@ -19,9 +19,21 @@ def sampled_size(film: mi.Film) -> mi.ScalarVector2u:
     return size + 2 * film.rfilter().border_size() if film.sample_border() else size
 
 
+def seeded(*numbers: int) -> int:
+    """A seed of 32 bits; other numbers give independent ones."""
+    return int(np.random.SeedSequence([int(n) for n in numbers]).generate_state(1)[0])
+
+
+def independent(seed: int, n: int) -> mi.Sampler:
+    """Independent numbers for n lanes."""
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, n)
+    return sampler
+
+
 def camera_rays(sensor: mi.Sensor, spp: int, seed: tuple[int, int]) -> tuple[mi.Ray3f, mi.Spectrum, mi.Vector2f]:
     """`rays_by` the sampler of the sensor."""
-    return rays_by(sensor, seeded_sampler(sensor, spp, int(np.random.SeedSequence(list(seed)).generate_state(1)[0])))
+    return rays_by(sensor, seeded_sampler(sensor, spp, seeded(*seed)))
 
 
 def seeded_sampler(sensor: mi.Sensor, spp: int, seed: int) -> mi.Sampler:

@@ -31,6 +31,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.geometry.sensors import seeded
 from full_geometry.inverse.views import GivenView
 from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.noise_free import NoiseFree
@@ -282,8 +283,7 @@ class ViewComparison:
         return max(float(view.counts.sum() * view.image.shape[2]), 1.0)
 
     def seed(self, k: int, which: int, purpose: str, parameter: int = 0) -> int:
-        words = [self.settings.seed, k, which, PURPOSES.index(purpose), parameter]
-        return int(np.random.SeedSequence(words).generate_state(1)[0])
+        return seeded(self.settings.seed, k, which, PURPOSES.index(purpose), parameter)
 
     def view(self, which: int, k: int, pair: Sequence[np.ndarray] = ()) -> ViewMisfit:
         """Compare a view with its image in step k; a view that is held out takes the exposure that suits it best.

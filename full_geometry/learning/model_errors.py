@@ -23,6 +23,7 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.geometry.points import SurfacePoint, Transport, evaluate
+from full_geometry.geometry.sensors import independent
 from full_geometry.objects.objects import TranslucentObject, object_of, refuse, refuse_textures, translucent_shapes
 from full_geometry.settings import Settings
 from full_geometry.transport.exit_pairs import EntryProposals, trace_exits
@@ -358,9 +359,7 @@ def mean_ratios(scene: mi.Scene, image: np.ndarray, sensor: int = 0, seed: int =
     # ---- a walk each
     settings = scene.integrator().settings.shared()
     walks = mi.load_dict({"type": "translucent_walk", **settings})
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(seed, WALKS)
-    L = weight * walks.sample(scene, sampler, mi.Ray3f(ray))[0]
+    L = weight * walks.sample(scene, independent(seed, WALKS), mi.Ray3f(ray))[0]
     walked = np.array(L).reshape(-1, WALKS)
 
     # ---- the image at these places

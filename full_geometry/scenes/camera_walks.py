@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.geometry.sensors import camera_rays, seeded
 from full_geometry.scenes.reference_store import Reference, finite_pixels, load, save
 
 if TYPE_CHECKING:
@@ -62,7 +63,6 @@ class CameraWalks:
     def hits(self, shape: mi.Shape) -> int:
         """About how many paths of one sample per pixel meet an object first."""
 
-        from full_geometry.geometry.sensors import camera_rays
         from full_geometry.integrators.walk_paths import FirstExits
 
         media = self.integrator.tracer(self.scene).visitor.media
@@ -81,11 +81,11 @@ class CameraWalks:
         name, kept = shape.id(), []
         media = self.integrator.tracer(self.scene).visitor.media
         k = self._number(media, shape)
-        key = np.random.SeedSequence([self.seed, 1, zlib.crc32(name.encode()), number])
+        seed = seeded(self.seed, 1, zlib.crc32(name.encode()), number)
         started = time.perf_counter()
         with dr.suspend_grad():
             image = self.integrator.render(
-                self.scene, self.sensor, mi.UInt32(int(key.generate_state(1)[0])), spp,
+                self.scene, self.sensor, mi.UInt32(seed), spp,
                 keep=lambda each: kept.append(each.of_object(k)),
             )  # fmt: skip
         if number != TRIAL:

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
-import numpy as np
 
+from full_geometry.geometry.sensors import seeded
 from full_geometry.geometry.snapshot import children, scene_hash, words
 from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.objects.objects import translucent_shapes
@@ -178,7 +178,7 @@ def _pass(
 ) -> Reference:
     number, sensor = reference.passes if reference else 0, about["sensor"]
     started = time.perf_counter()
-    seed = int(np.random.SeedSequence([about["seed"], number]).generate_state(1)[0])
+    seed = seeded(about["seed"], number)
     image = mi.render(scene, sensor=sensor, integrator=integrator, seed=seed, spp=spp)
     image = finite_pixels(f"pass {number}", image)
     if reference is None and (names := channel_names(scene.sensors()[sensor].film(), integrator, image.shape[2])):

@@ -12,6 +12,7 @@ from typing import Any
 
 import mitsuba as mi
 
+from full_geometry.geometry.sensors import seeded
 from full_geometry.integrators.gathering import PART
 from full_geometry.learning.learners import Learner, learner
 from full_geometry.scenes.reference import check_sensor
@@ -19,7 +20,6 @@ from full_geometry.scenes.scene_files import PATH_TRACED, first_cause
 from full_geometry.trade.images import with_flip
 from full_geometry.trade.measuring import OWN_SHARE, RunBudget, SceneSamples
 from full_geometry.trade.results import Assessment, ObjectTrade, TechniqueTrade, samples_for
-from full_geometry.trade.statistics import seeded
 from full_geometry.trade.techniques import (
     GATHERED,
     PRECOMPUTED_WALKS,

@@ -12,11 +12,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.geometry.sensors import independent, seeded
 from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.trade.image_differences import mean_flip
 from full_geometry.trade.results import Assessment
 from full_geometry.trade.sampling import radiance
-from full_geometry.trade.statistics import seeded
 from full_geometry.trade.techniques import Stage, Technique, stage
 
 SIDE, SPP = 40, 32
@@ -58,8 +58,7 @@ def _rendered(
 ) -> np.ndarray:
     """Rays of the camera over its whole film, averaged in fewer pixels."""
     n = size[0] * size[1] * spp
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(seed, n)
+    sampler = independent(seed, n)
     index = dr.arange(mi.UInt32, n) // dr.opaque(mi.UInt32, spp)
     x, y = index % dr.opaque(mi.UInt32, size[0]), index // dr.opaque(mi.UInt32, size[0])
     inverse = mi.Vector2f(dr.opaque(mi.Float, 1 / size[0]), dr.opaque(mi.Float, 1 / size[1]))

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.geometry.sensors import seeded
 from full_geometry.integrators.translucent_walk import SAMPLES_PER_RAY
 from full_geometry.learning.learners import learners
 from full_geometry.scenes.scene_files import first_cause
@@ -36,7 +37,6 @@ from full_geometry.trade.statistics import (
     noise_of_parts,
     ratio_of_means,
     relative_variance,
-    seeded,
     with_prior,
 )
 from full_geometry.trade.techniques import GATHERED, PRECOMPUTED, RAYS, WALKS, Effort, Stage, Technique

@@ -14,6 +14,7 @@ import numpy as np
 
 from full_geometry.geometry.instances import InstanceScene, bounds_of
 from full_geometry.geometry.rounding import ray_from
+from full_geometry.geometry.sensors import independent, seeded
 from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.integrators.gathering import PART
 from full_geometry.integrators.translucent_walk import SAMPLES_PER_RAY
@@ -21,7 +22,7 @@ from full_geometry.precomputed.transport_matrix import R_2
 from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.settings import variant_channels
 from full_geometry.surface.wrapped import surface_of
-from full_geometry.trade.statistics import RadianceEstimate, seeded
+from full_geometry.trade.statistics import RadianceEstimate
 from full_geometry.trade.techniques import GATHERED, PRECOMPUTED, RAYS, Stage, Technique
 from halfspace_sss.backend import clock
 
@@ -180,7 +181,7 @@ def sample_blur(stage: Stage, exits: Exits, seed: int, samples: int) -> Radiance
     while (each := min(samples - estimate.samples, most)) > 0:
         number, rays = seeded(seed, 33, estimate.samples), exits.rays(each)
         without, spread = (
-            radiance(stage.lit(w), stage.integrator(w), _sampler(number, rays), rays) for w in techniques
+            radiance(stage.lit(w), stage.integrator(w), independent(number, dr.width(rays)), rays) for w in techniques
         )
         estimate.add(*_sums([b - a for a, b in zip(without, spread)], each), each)
     return estimate
@@ -206,7 +207,7 @@ def _launch(
     dr.flush_malloc_cache()
     dr.detail.malloc_clear_statistics()
     started = clock()
-    L = _recorded(stage.lit(technique), stage.integrator(technique), _sampler(seed, rays), rays)
+    L = _recorded(stage.lit(technique), stage.integrator(technique), independent(seed, dr.width(rays)), rays)
     recorded = clock()
     dr.eval(L)
     first, second = _sums(L, each)
@@ -215,12 +216,6 @@ def _launch(
     estimate.add(first, second, each)
     estimate.add_bright(np.array([c.numpy() for c in L]), each)
     return TimedLaunch(memory, ended - started, recorded - started)
-
-
-def _sampler(seed: int, rays: mi.Ray3f) -> mi.Sampler:
-    result = mi.load_dict({"type": "independent"})
-    result.seed(seed, dr.width(rays))
-    return result
 
 
 def _sums(L: list[mi.Float], each: int) -> tuple[np.ndarray, np.ndarray]:

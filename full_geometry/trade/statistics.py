@@ -204,8 +204,3 @@ def _ratio(top: np.ndarray, bottom: np.ndarray, power: int) -> Number:
     tops, bottoms = (top.sum() - top) / (n - 1), (bottom.sum() - bottom) / (n - 1)
     parts = tops / np.maximum(bottoms, 1e-300) ** power
     return Number(float(whole), float(np.sqrt((n - 1) * np.mean((parts - parts.mean()) ** 2))))
-
-
-def seeded(*numbers: int) -> int:
-    """A seed of 32 bits; other numbers give independent ones."""
-    return int(np.random.SeedSequence([int(n) for n in numbers]).generate_state(1)[0])
