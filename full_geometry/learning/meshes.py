@@ -218,8 +218,8 @@ class Mesh:
         a, b, c = np.moveaxis(self.vertices[self.faces], 1, 0)
         return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
 
-    def mitsuba(self, name: str, bsdf: mi.BSDF | None = None) -> mi.Mesh:
-        """The mesh as a shape of Mitsuba, with smooth normals; bsdf is a loaded BSDF, by default a diffuse one.
+    def mitsuba(self, name: str) -> mi.Mesh:
+        """The mesh as a diffuse shape of Mitsuba, with smooth normals.
 
         Normals by libigl: Mitsuba adds them up in the order of its threads, which differs in the last bit.
         """
@@ -228,10 +228,7 @@ class Mesh:
 
         from full_geometry.geometry.mesh import fill, set_vertex_normals
 
-        props = mi.Properties()
-        if bsdf is not None:
-            props["mesh_bsdf"] = bsdf
-        mesh = mi.Mesh(name, len(self.vertices), len(self.faces), props=props, has_vertex_normals=True)
+        mesh = mi.Mesh(name, len(self.vertices), len(self.faces), has_vertex_normals=True)
         fill(mesh, self.vertices, self.faces)
         normals = igl.per_vertex_normals(self.vertices, self.faces, igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_ANGLE)
         set_vertex_normals(mesh, normals)

@@ -41,6 +41,7 @@ from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.neural.store import check_weights_folder, to_json
 from halfspace_sss.neural.training.unfinished import CHECKPOINT, claim
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import check_folder, provenance, write_atomically
 
 if TYPE_CHECKING:
@@ -192,7 +193,6 @@ def _lanes(numbers: np.ndarray) -> mi.UInt32:
     return mi.UInt32(numbers.astype(np.uint32))
 
 
-Progress = Callable[[str, int, int], None]
 VALIDATIONS = 4  # in a run
 EXITS, WALKS, SAMPLES = 256, 2048, 512  # of a validation
 CHECKPOINT_EVERY = 15.0  # seconds
@@ -260,7 +260,7 @@ def train(
     folder: str | Path | None = None,
     work: str | Path | None = None,
     camera: CameraWalks | None = None,
-    progress: Progress | None = None,
+    progress: NamedProgress | None = None,
     **plan: Any,
 ) -> Trained:
     """Learn S of an object and write its weights.
@@ -371,7 +371,7 @@ class _ObjectTraining:
         return storing.assemble(self.object, self.frame, self.base, self.arrays(), self.patches)
 
     def go(
-        self, seconds: float, chunks: int | None, target: float | None, folder: Path, progress: Progress | None
+        self, seconds: float, chunks: int | None, target: float | None, folder: Path, progress: NamedProgress | None
     ) -> Trained:
         started, began = time.monotonic(), clock()
         self._prepare(chunks)
