@@ -47,7 +47,7 @@ pytestmark = pytest.mark.usefixtures("rgb")
 
 BUNNY = Path(__file__).parents[2] / "figures" / "assets" / "bunny.ply"
 QUICK = Recipe(width=32, depth=2, batch=1024, chunk=2**15, reuse=4)
-CHUNKS, PASSES = 16, 6
+CHUNKS, PASSES = 10, 6
 COLOURS = {"sigma_s": "0.95,0.8,0.6", "sigma_a": "0.05,0.2,0.4", "eta": 1.4}
 WAX = Medium(np.array([0.95, 0.8, 0.6]), np.array([0.05, 0.2, 0.4]), 0.0, 1.4)
 SURFACE = {"type": "translucent", **COLOURS, "model": "full_geometry", "orders": "multiple", "reflection": False}
@@ -122,7 +122,7 @@ def test_other_numbers_of_samples_need_no_new_kernel(trained: Trained) -> None:
 def test_a_coarse_ball_with_vertex_normals_has_the_light_of_walks(folder: Path, tmp_path: Path) -> None:
     """Without what enters or leaves below the horizon of its interpolated normals 2.7 % were missing."""
     ball = {**coarse_ball(tmp_path), "to_world": mi.ScalarTransform4f().scale(4.0)}
-    train(mi.load_dict(ball), WAX, chunks=CHUNKS // 2, recipe=QUICK, folder=folder)
+    train(mi.load_dict(ball), WAX, chunks=8, recipe=QUICK, folder=folder)
     objects = {"ball": {**ball, "bsdf": SURFACE}}
     found, walked = (halves(objects, model, 512).mean(axis=1) for model in ("full_geometry", "path_traced"))
     errors = [v.std(axis=0, ddof=1) / np.sqrt(PASSES) / v.mean(axis=0) for v in (found, walked)]
