@@ -24,7 +24,12 @@ LESS = {  # what a command is given beside, by its first words, as it would take
     "train material": "--channel R --steps 100",
     "trade": "--assess 0.1",
 }
-SLOW = "halfspace-sss figures"
+FIGURE = "halfspace-sss figures"
+SMALLER = """
+from figures import fig09
+
+fig09.SHOWN, fig09.MODELS, fig09.SIZES = {"draft": ("ketchup",)}, ("better_dipole",), {"draft": 24}
+"""
 SCENE = """<scene version="3.0.0">
     <integrator type="bssrdf"/> <emitter type="constant"/>
     {shape}
@@ -65,12 +70,13 @@ def _shortened(line: str) -> str:
     return " ".join([line, *(more for start, more in LESS.items() if words.startswith(start))])
 
 
-def _run(lines: list[str], folder: Path) -> None:
+def _run(lines: list[str], folder: Path, before: str = "") -> None:
+    """Run commands after the statements `before`."""
     home = folder / "home"
     home.mkdir()
     kept = {k: v for k, v in os.environ.items() if not k.startswith(("XDG_", "HALFSPACE_SSS", "MPL"))}
     run = subprocess.run(
-        [sys.executable, "-c", RUN, *lines], cwd=folder, capture_output=True, text=True,
+        [sys.executable, "-c", before + RUN, *lines], cwd=folder, capture_output=True, text=True,
         env={**kept, "HOME": str(home), "PYTHONPATH": os.pathsep.join(sys.path)},
     )  # fmt: skip
     assert run.returncode == 0, run.stderr
@@ -99,10 +105,11 @@ def test_the_commands_of_the_readme_run(tmp_path: Path) -> None:
     lines = _commands("README.md")
     others = [line for line in lines if not line.startswith("halfspace-sss ")]
     assert all(line == "pytest" or line.startswith("pip install -c constraints.txt ") for line in others)
-    _run([_shortened(line) for line in lines if line not in others and not line.startswith(SLOW)], tmp_path)
+    _run([_shortened(line) for line in lines if line not in others and not line.startswith(FIGURE)], tmp_path)
 
 
 def test_the_figure_of_the_readme_is_drawn(tmp_path: Path) -> None:
-    lines = [line for line in _commands("README.md") if line.startswith(SLOW)]
+    """Of one material by walks and a model, with few pixels; `test_fig09.py` knows others."""
+    lines = [line for line in _commands("README.md") if line.startswith(FIGURE)]
     assert lines
-    _run(lines, tmp_path)
+    _run(lines, tmp_path, SMALLER)
