@@ -151,31 +151,6 @@ def test_light_is_gathered_anew_when_an_emitter_was_edited() -> None:
     assert "gathered at" in edited.integrator().gathered[0]
 
 
-@pytest.mark.slow
-def test_light_is_gathered_anew_when_texels_of_the_sky_were_edited() -> None:
-    texels = np.ones((32, 64, 3), np.float32)
-    edited = _scene("gathered", lights={"sky": {"type": "envmap", "bitmap": mi.Bitmap(texels)}})
-    before, parameters = _image(edited, 4), mi.traverse(edited)
-    data = np.array(parameters["sky.data"])
-    data[15:17] = 20.0
-    parameters["sky.data"] = mi.TensorXf(data)
-    parameters.update()
-    after, fresh = _image(edited, 4), _image(_scene("gathered", lights={"sky": edited.emitters()[0]}), 4)
-    assert after.mean() > 1.5 * before.mean() and np.allclose(after, fresh, rtol=1e-3)
-
-
-@pytest.mark.slow
-def test_transfer_is_made_anew_when_the_medium_was_edited() -> None:
-    edited = _scene("gathered", lights=_lights("sky"))
-    _image(edited, 4)
-    parameters = mi.traverse(edited)
-    key = next(k for k in parameters.keys() if k.endswith("sigma_t"))
-    parameters[key] = type(parameters[key])(np.array(parameters[key]) * 2)
-    parameters.update()
-    fresh = _scene("gathered", lights=_lights("sky"), sigma_s="2,3,4", sigma_a=".04,.2,.6")
-    assert np.allclose(_image(edited, 16), _image(fresh, 16), rtol=1e-3)
-
-
 def _refused(message: str, scene: Any) -> None:
     with pytest.raises((ValueError, RuntimeError), match=message):
         mi.render(scene, spp=1)
