@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("spectral")
 
 EVEN = {"type": "uniform", "value": 1.0}  # plain numbers of emitters are D65
 SPECTRUM = {"type": "irregular", "wavelengths": "300, 500, 900", "values": "0.5, 0.9, 0.1"}
-RUNS = 16
+RUNS = 8
 SHORT = {"type": "irregular", "wavelengths": "400, 700", "values": "1, 2"}
 
 
@@ -60,13 +60,13 @@ def test_each_wavelength_is_that_of_a_mono_render(integrator: dict, light: str, 
     skin, wavelengths = _skin(), np.linspace(400, 700, n)
     scene = _scene(skin.surface(), _lights()[light], **integrator)
     scene["sensor"]["film"] = _bands(wavelengths)
-    spectral = _runs(mi.load_dict(scene), RUNS, 16 * n, 1).mean(axis=(1, 2))
+    spectral = _runs(mi.load_dict(scene), RUNS, 32 * n, 1).mean(axis=(1, 2))
     mi.set_variant("llvm_ad_mono")
     z = []
     for k, nm in enumerate(wavelengths):
         m = skin.medium(float(nm))
         surface = {"sigma_s": m.sigma_s, "sigma_a": m.sigma_a, "g": m.g, "eta": skin.surface()["eta"]}
-        mono = _runs(mi.load_dict(_scene(surface, _lights()[light], **integrator)), RUNS, 32, 100 * (k + 1))[..., 0]
+        mono = _runs(mi.load_dict(_scene(surface, _lights()[light], **integrator)), RUNS, 64, 100 * (k + 1))[..., 0]
         a, b = spectral[:, k], mono.mean(axis=(1, 2))
         z.append((a.mean() - b.mean()) / np.hypot(a.std(ddof=1), b.std(ddof=1)) * np.sqrt(RUNS))
     assert np.abs(z).max() < 4, z
@@ -101,9 +101,9 @@ def test_models_take_the_medium_at_each_wavelength(model: str) -> None:
 def test_a_grey_medium_under_d65_is_grey() -> None:
     """The film turns spectra into sRGB, whose white is D65."""
     grey = {"sigma_s": 1.0, "sigma_a": 0.1, "eta": 1.3}
-    images = _runs(mi.load_dict(_scene(grey)), 12, 256, 1)
+    images = _runs(mi.load_dict(_scene(grey)), 6, 512, 1)
     mi.set_variant("llvm_ad_mono")
-    mono = np.repeat(_runs(mi.load_dict(_scene(grey)), 12, 64, 100)[..., :1], 3, axis=-1)
+    mono = np.repeat(_runs(mi.load_dict(_scene(grey)), 6, 128, 100)[..., :1], 3, axis=-1)
     assert np.abs(_z(images, mono)).max() < WIDEST_Z_OF_RUNS
 
 
