@@ -17,7 +17,7 @@ pytestmark = pytest.mark.usefixtures("rgb")
 mi = pytest.importorskip("mitsuba")
 
 WIDEST_Z = 4.4  # two-sided 1e-5, for a few hundred comparisons
-WIDEST_Z_OF_RUNS = 6.0  # Student's t with about 20 degrees of freedom
+WIDEST_Z_OF_RUNS = 6.0  # Student's t with about 10 degrees of freedom
 LARGEST_ERROR = 0.05  # of the mean of an image
 COLOURED = {"sigma_s": "0.5,1.0,2.0", "sigma_a": "0.01,0.1,0.5"}
 
@@ -97,7 +97,7 @@ def test_images_agree_with_the_volume_path_tracer_of_mitsuba(surface: dict, shap
     scene = _scene(surface, None if uniform else _lamp(), _cube() if shape else None, mm_per_unit=1.2)
     theirs = with_media(scene, 1.2, {"type": "volpathmis", "max_depth": -1, "rr_depth": 1000})
     spp = 32 if uniform else 128
-    _agree(_runs(mi.load_dict(scene), 12, spp, 1), _runs(theirs, 12, spp, 1001))
+    _agree(_runs(mi.load_dict(scene), 6, 2 * spp, 1), _runs(theirs, 6, 2 * spp, 1001))
 
 
 def test_a_large_flat_box_shows_the_reflectance_of_the_half_space() -> None:
@@ -141,7 +141,7 @@ def test_a_large_ball_far_from_the_origin_shows_the_reflectance_of_the_half_spac
 def test_light_that_joins_bring_does_not_depend_on_the_origin_of_the_scene() -> None:
     sun = {"type": "directional", "direction": [0.5, 0.3, -0.8], "irradiance": 3.0}
     near, far = (
-        _runs(mi.load_dict(_top_of_ball(away, 0.6, sun)), 12, 256, seed) for away, seed in ((100.0, 1), (5000.0, 101))
+        _runs(mi.load_dict(_top_of_ball(away, 0.6, sun)), 6, 512, seed) for away, seed in ((100.0, 1), (5000.0, 101))
     )
     _agree(far, near, 0.01)
 
@@ -149,7 +149,7 @@ def test_light_that_joins_bring_does_not_depend_on_the_origin_of_the_scene() -> 
 def test_single_and_multiple_scattering_add_up_to_the_total() -> None:
     surface = {**COLOURED, "g": 0.3, "eta": 1.3}
     single, multiple, total = (
-        _runs(mi.load_dict(_scene({**surface, "orders": orders, "reflection": False}, _lamp())), 12, 128, seed)
+        _runs(mi.load_dict(_scene({**surface, "orders": orders, "reflection": False}, _lamp())), 6, 256, seed)
         for orders, seed in (("single", 1), ("multiple", 100), ("total", 200))
     )
     _agree(single + multiple, total)
@@ -167,7 +167,7 @@ def _small_lamp() -> dict:
 def test_connections_bring_the_light_that_chance_brings_with_less_noise() -> None:
     surface = {"sigma_s": 0.5, "sigma_a": 0.02, "eta": 1.5, "reflection": False, "orders": "multiple"}
     joined, left_to_chance = (
-        _runs(mi.load_dict(_scene(surface, _small_lamp(), _cube(), connection_share=share)), 12, spp, 1)
+        _runs(mi.load_dict(_scene(surface, _small_lamp(), _cube(), connection_share=share)), 6, 2 * spp, 1)
         for share, spp in ((0.5, 64), (0.0, 1024))
     )
     _agree(joined, left_to_chance, known_to=0.1)
@@ -180,7 +180,7 @@ def test_a_point_light_is_seen_as_a_small_lamp_of_the_same_power() -> None:
     place, radius = [20.0, 30.0, 40.0], 0.5
     lamp = {"type": "sphere", "center": place, "radius": radius, "emitter": {"type": "area", "radiance": 100.0}}
     point = {"type": "point", "position": place, "intensity": 100.0 * np.pi * radius**2}
-    a, b = (_runs(mi.load_dict(_scene(surface, light)), 12, 128, seed) for light, seed in ((lamp, 1), (point, 100)))
+    a, b = (_runs(mi.load_dict(_scene(surface, light)), 6, 256, seed) for light, seed in ((lamp, 1), (point, 100)))
     _agree(a, b)
 
 
@@ -197,13 +197,13 @@ def test_objects_of_different_media_stand_in_one_scene() -> None:
     other = {"type": "translucent", "sigma_s": 1.0, "sigma_a": "1,0.1,0.01", "g": 0.5, "eta": 1.3}
     scene["other"] = {"type": "sphere", "radius": 4.0, "center": [5, 0, 0], "bsdf": other}
     theirs = with_media(scene, 1.0, {"type": "volpathmis", "max_depth": -1, "rr_depth": 1000})
-    _agree(_runs(mi.load_dict(scene), 12, 64, 1), _runs(theirs, 12, 64, 100))
+    _agree(_runs(mi.load_dict(scene), 6, 128, 1), _runs(theirs, 6, 128, 100))
 
 
 def test_a_mono_variant_renders_one_channel_of_the_colours() -> None:
-    colours = _runs(mi.load_dict(_scene({**COLOURED, "eta": 1.3})), 12, 64, 1)[..., 1:2]
+    colours = _runs(mi.load_dict(_scene({**COLOURED, "eta": 1.3})), 6, 128, 1)[..., 1:2]
     mi.set_variant("llvm_ad_mono")
-    grey = _runs(mi.load_dict(_scene({"sigma_s": 1.0, "sigma_a": 0.1, "eta": 1.3})), 12, 64, 100)[..., :1]
+    grey = _runs(mi.load_dict(_scene({"sigma_s": 1.0, "sigma_a": 0.1, "eta": 1.3})), 6, 128, 100)[..., :1]
     _agree(colours, grey)
 
 
