@@ -6,7 +6,8 @@ The error of an image X over a reference R is
 
 over all pixels of the object and channels, of pixels and of means over blocks of 8 x 8. R is a long image by walks
 whose light is sampled, which has no bias; its variance is taken off. Ways are path tracing by Mitsuba's `volpathmis` at
-two roulette depths, walks with sampled and with precomputed light, each as rendered and denoised by Open Image Denoise.
+two roulette depths, walks with sampled and with precomputed light, and light that is gathered by a model and corrected
+by walks, each as rendered and denoised by Open Image Denoise.
 Beside it stand what the object is in the mean over R, and the variance of a sample times its CPU seconds, summed over
 the pixels, over that of `volpathmis` at its better depth.
 """
@@ -30,7 +31,8 @@ from figures.parts.part import Row
 from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
 
 SAMPLED, PRECOMPUTED = "walk, light sampled", "walk, light precomputed"
-WAYS = (*VOLUMES, SAMPLED, PRECOMPUTED)
+MODEL, CORRECTED = "better_dipole", "better_dipole, light corrected"
+PASSING = (*VOLUMES, SAMPLED, PRECOMPUTED)  # whose passes are independent
 BLOCK = 8  # pixels of its side
 REFERENCE_SPP = 64  # of a pass of the reference
 MOST_SPP = 1024  # of a pass
@@ -71,43 +73,61 @@ def _scene(case: LitObject, way: str, size: int, folder: Path) -> mi.Scene:
     found = case.description(size, folder)
     if way in VOLUMES:
         return ready(way, found, case.key, case.medium)
+    if way == CORRECTED:
+        return load_scene(found, MODEL, settings={"light": "corrected"})
     kind = "sampled" if way == SAMPLED else "precomputed"
     return load_scene(found, PATH_TRACED, settings={"light": kind, "layers": True})
 
 
 def _measured(case: LitObject, how: TotalErrors, folder: Path) -> list[Row]:
-    scenes = {way: _scene(case, way, how.size, folder) for way in WAYS}
+    scenes = {way: _scene(case, way, how.size, folder) for way in PASSING}
     inside = cover(scenes[SAMPLED]) > 0
     about = guides(scenes[SAMPLED])
     reference = _passes(scenes[SAMPLED], how.reference, REFERENCE_SPP, how.seed + 1)[0][..., :3]
     R, noise = reference.mean(axis=0), reference.var(axis=0, ddof=1) / len(reference)
 
-    # ---- passes of every way, from which the images of all times are made
-    images, seconds, spp = {}, {}, {}
+    # ---- images of every way after each time: means of passes, and corrected light from its beginning
+    found: dict[tuple[str, float], tuple[np.ndarray, int]] = {}
+    costs = {}
     for way, scene in scenes.items():
-        each = _samples(scene, how.seconds[0] / SHARE, how.seed)
-        images[way], seconds[way] = _passes(scene, how.seconds[-1], each, how.seed + 1000)
-        spp[way] = each
-    costs = {way: _cost(images[way][..., :3], seconds[way], inside) for way in WAYS}
+        spp = _samples(scene, how.seconds[0] / SHARE, how.seed)
+        images, seconds = _passes(scene, how.seconds[-1], spp, how.seed + 1000)
+        for limit in how.seconds:
+            n = int(np.clip(np.searchsorted(np.cumsum(seconds), limit, side="right"), 1, len(seconds)))
+            found[way, limit] = images[:n].mean(axis=0), n * spp
+        costs[way] = _cost(images[..., :3], seconds, inside)
+    for limit in how.seconds:
+        found[CORRECTED, limit] = _corrected(lambda: _scene(case, CORRECTED, how.size, folder), limit, how.seed)
     best = min(costs[way] for way in VOLUMES)
 
+    # ---- a row for each, raw and denoised
     rows = []
-    for way in WAYS:
-        for limit in how.seconds:
-            n = int(np.clip(np.searchsorted(np.cumsum(seconds[way]), limit, side="right"), 1, len(seconds[way])))
-            image = images[way][:n].mean(axis=0)
-            for name, result in (("raw", image[..., :3]), ("denoised", _clean(image, about))):
-                pixels, blocks = (_error(result, R, noise, inside, size) for size in (1, BLOCK))
-                mean = result[inside].mean(axis=0) / R[inside].mean(axis=0)
-                rows.append(
-                    {
-                        "object": case.name, "light": case.light, "way": f"{way}, {name}", "seconds": limit,
-                        "spp": n * spp[way], "pixels, %": 100 * pixels, "blocks, %": 100 * blocks,
-                        "mean R": mean[0], "mean G": mean[1], "mean B": mean[2],
-                        "variance x time": best / costs[way] if name == "raw" else np.nan,
-                    }
-                )  # fmt: skip
+    for (way, limit), (image, spp) in found.items():
+        for name, result in (("raw", image[..., :3]), ("denoised", _clean(image, about))):
+            pixels, blocks = (_error(result, R, noise, inside, size) for size in (1, BLOCK))
+            mean = result[inside].mean(axis=0) / R[inside].mean(axis=0)
+            rows.append(
+                {
+                    "object": case.name, "light": case.light, "way": f"{way}, {name}", "seconds": limit,
+                    "spp": spp, "pixels, %": 100 * pixels, "blocks, %": 100 * blocks,
+                    "mean R": mean[0], "mean G": mean[1], "mean B": mean[2],
+                    "variance x time": best / costs[way] if name == "raw" and way in costs else np.nan,
+                }
+            )  # fmt: skip
     return rows
+
+
+def _corrected(fresh: Callable[[], mi.Scene], limit: float, seed: int) -> tuple[np.ndarray, int]:
+    """The image of most samples, a power of two, whose light and pixels take so many CPU seconds from a fresh scene."""
+    spp, best = 1, None
+    mi.render(fresh(), spp=1, seed=seed)  # compiles
+    while spp <= MOST_SPP:
+        scene, started = fresh(), time.process_time()
+        image = np.array(mi.render(scene, spp=spp, seed=seed), dtype=np.float64)
+        if time.process_time() - started > limit and best is not None:
+            break
+        best, spp = (image, spp), 2 * spp
+    return best
 
 
 def _samples(scene: mi.Scene, seconds: float, seed: int) -> int:

@@ -12,6 +12,7 @@ CURVES = {
     "volpathmis": ("volpathmis", "#888888"),
     "walk, light sampled": ("walk, sampled light", "#3465a4"),
     "walk, light precomputed": ("walk, precomputed light", "#c0392b"),
+    "better_dipole, light corrected": ("better_dipole, corrected light", "#2e7d32"),
 }
 
 

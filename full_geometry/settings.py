@@ -15,7 +15,8 @@ AUTOMATIC = -1.0
 MM_PER_UNIT = (1e-9, 1e9)
 ORDERS = ("total", "multiple", "single")
 GEOMETRIES = ("distance", "tangent")
-LIGHTS = ("sampled", "gathered", "auto")
+LIGHTS = ("sampled", "gathered", "corrected", "auto")
+GATHERED = ("gathered", "corrected")
 WALK_LIGHTS = ("auto", "precomputed", "sampled")  # of `translucent_walk`
 SHARED = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters")  # what `translucent_walk` understands too
 OF_MODELS = ("geometry", "area_share", "entries")
@@ -35,8 +36,10 @@ class Settings:
             object.
         entries: points of entry that an exit draws, of which one is followed, chosen by what it may bring; AUTOMATIC
             leaves it to the model.
-        light: "sampled", without bias; "gathered" once for all samples, see `integrators.gathering`: scattered light
-            has a little bias and no noise; or "auto", the cheaper of both that keeps the tolerance, by measurement.
+        light: "sampled", without bias beside that of the model; "gathered" once for all samples, see
+            `integrators.gathering`: scattered light has no noise, and a little more bias; "corrected", gathered and
+            then corrected by random walks, see `integrators.correction`; or "auto", the cheaper of the first two that
+            keeps the tolerance, by measurement.
         hide_emitters: whether directly visible emitters are left out.
         tolerance: relative error of the radiance of an object that its model "auto" keeps, if one does.
         choice_share: of the samples of the first sensor's image, that the choice of "auto" may take; see

@@ -24,12 +24,13 @@ from full_geometry.geometry.sensors import (
     shows_sky,
     splat,
 )
+from full_geometry.integrators.correction import Corrections
 from full_geometry.integrators.gathering import Gathering
 from full_geometry.integrators.lit_entries import LitEntries
 from full_geometry.integrators.surface_paths import replay_paths, trace_paths
 from full_geometry.objects.objects import KnowsUnit, TranslucentObject
 from full_geometry.objects.small_emitters import check_emitters
-from full_geometry.settings import Choices, Settings, read_settings
+from full_geometry.settings import GATHERED, Choices, Settings, read_settings
 from full_geometry.surface.translucent import is_translucent
 from full_geometry.surface.wrapped import wraps
 from full_geometry.transport.prepare import Chooser, TranslucentObjects, choices_of, make_objects
@@ -75,23 +76,29 @@ def _class(variant: str) -> type:
             self.settings = read_settings(props)
             self.mm_per_unit = self.settings.mm_per_unit
             self._objects = TranslucentObjects(self.settings, choose)
-            self.gathering = Gathering()
+            self.gathering, self.corrections = Gathering(), Corrections()
             self._lit_entries = LitEntries()
             self._lit: list[TranslucentObject] | None = None  # while an image is rendered
             self._unconnected = dr.zeros(mi.Float64, 1)
 
-        def prepare(self, scene: mi.Scene) -> list[TranslucentObject]:
-            """The translucent objects of a scene, made ready once; ValueError if the scene cannot be rendered."""
+        def prepare(self, scene: mi.Scene, samples: int = 0) -> list[TranslucentObject]:
+            """The translucent objects of a scene, made ready once; ValueError if the scene cannot be rendered.
+
+            Args:
+                scene: of Mitsuba.
+                samples: of an image, by which corrected light has its walks.
+            """
             check_parameters(scene)
             check_emitters(scene)
             with dr.suspend_grad():
-                return self._prepared(scene)
+                return self._prepared(scene, samples)
 
-        def _prepared(self, scene: mi.Scene) -> list[TranslucentObject]:
-            objects = self._objects.of(scene)
-            if self._objects.choices.light != "gathered":
+        def _prepared(self, scene: mi.Scene, samples: int = 0) -> list[TranslucentObject]:
+            objects, light = self._objects.of(scene), self._objects.choices.light
+            if light not in GATHERED:
                 return objects
-            return self.gathering.of(scene, objects, self.settings)
+            objects = self.gathering.of(scene, objects, self.settings)
+            return self.corrections.of(scene, objects, self.settings, samples) if light == "corrected" else objects
 
         def take_over(self, other: mi.Integrator) -> None:
             """Take the objects of another integrator of this class that differs in light alone."""
@@ -112,7 +119,8 @@ def _class(variant: str) -> type:
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             with interruptible(), undisturbed(), dr.suspend_grad():
                 # ---- the objects, and proposals for their entries by the light
-                objects = self.prepare(scene)
+                samples = (spp or sensor.sampler().sample_count()) * int(dr.prod(sampled_size(sensor.film())))
+                objects = self.prepare(scene, samples)
                 for obj in objects:
                     if obj.spectral is not None:
                         obj.spectral.check_covers(obj.geometry.name, sensor)
@@ -142,7 +150,7 @@ def _class(variant: str) -> type:
             self, scene: mi.Scene, objects: list[TranslucentObject], sensor: mi.Sensor, spp: int
         ) -> list[TranslucentObject]:
             """The objects with entries drawn by light, where that pays."""
-            if self._objects.choices.light == "gathered":
+            if self._objects.choices.light in GATHERED:
                 return objects
             # the more samples an image has, the more are spent on where light arrives
             spp, pixels = spp or sensor.sampler().sample_count(), int(dr.prod(sensor.film().crop_size()))
@@ -192,8 +200,8 @@ def _class(variant: str) -> type:
 
         @property
         def gathered(self) -> list[str]:
-            """A sentence on the light that was gathered for each object, with its noise."""
-            return self.gathering.told()
+            """A sentence on the light that was gathered, and corrected, for each object, with its error."""
+            return self.gathering.told() + self.corrections.told()
 
         def to_string(self) -> str:
             return f"BSSRDFIntegrator[{self.settings}]"

@@ -30,6 +30,7 @@ from full_geometry.integrators.lighting import EnvironmentMean, Lights
 from full_geometry.integrators.surface_paths import trace_paths
 from full_geometry.precomputed.inner import Events, InnerLight, has_inner_light
 from full_geometry.precomputed.point_pairs import Rays
+from full_geometry.precomputed.surface_regression import directional
 from full_geometry.precomputed.transport_matrix import (
     SEED,
     Albedo,
@@ -65,12 +66,13 @@ class Gathered:
         object: that the light leaves.
         points: where B is known.
         albedo: a(mu).
-        values: B of all points, for each channel the constant and the slope over w_o bent by the boundary.
+        values: B of all points, for each channel the first terms of `directional` in w_o bent by the boundary.
         inner: at events of order 1 inside; None where that order is traced.
         matrix: transport matrix of the model.
         light: that arrives, less c.
         parts: independent estimates of it.
         c: mean radiance of the environment where alpha is known, else 0, see `lighting.EnvironmentMean`.
+        terms: how many for each channel.
     """
 
     object: TranslucentObject
@@ -82,26 +84,32 @@ class Gathered:
     light: Incident
     parts: tuple[Incident, ...] = ()
     c: np.ndarray | float = 0.0
+    terms: int = 4
 
     def radiance(self, out: SurfacePoint, active: mi.Bool) -> mi.Spectrum:
         """L_o of an exit; 0 below the horizon."""
-        # B_0 + B_1.w_o at the exit, blended between points, w_o bent by the boundary
+        # B.Y(w_o) at the exit, blended between points, w_o bent by the boundary
         size = dr.size_v(mi.Spectrum)
-        B = self.points.blend(self.values, 4 * size, out.p, out.n, active)
-        rows, w = [B[4 * c : 4 * c + 4] for c in range(size)], bent(out.w, out.n_out, self.albedo.eta)
-        B = mi.Spectrum([b + x * w.x + y * w.y + z * w.z for b, x, y, z in rows])
+        B = self.points.blend(self.values, self.terms * size, out.p, out.n, active)
+        w = bent(out.w, out.n_out, self.albedo.eta)
+        Y = directional(w.x, w.y, w.z)
+        rows = [B[self.terms * c : self.terms * (c + 1)] for c in range(size)]
+        B = mi.Spectrum([sum(b * y for b, y in zip(row, Y)) for row in rows])
 
-        # a(w_o) R^e, or alpha where the model knows its directional albedo
-        mu = dr.dot(out.w, out.n_out)
+        return dr.select(active & (dr.dot(out.w, out.n_out) > 0), self.factor(out, active) * dr.maximum(B, 0), 0)
+
+    def factor(self, out: SurfacePoint, active: mi.Bool) -> mi.Spectrum:
+        """L_o / B of an exit: a(w_o) R^e, or alpha in the channels where the model knows its directional albedo."""
+        mu = dr.maximum(dr.dot(out.w, out.n_out), 0)
         paint = None if self.object.textured is None else self.object.transport.paint(out)
-        a = self.albedo(dr.maximum(mu, 0), paint)
+        a = self.albedo(mu, paint)
         if paint is not None:
             a *= paint ** mi.Spectrum([opaque(v) for v in self.matrix.e])
         alpha = self.object.transport.alpha
-        if alpha is not None:
-            known = alpha.known[1]
-            a = known * alpha(out, active)[1] + (1 - known) * a
-        return dr.select(active & (mu > 0), a * dr.maximum(B, 0), 0)
+        if alpha is None:
+            return a
+        known = alpha.known[1]
+        return known * alpha(out, active)[1] + (1 - known) * a
 
     @cached_property
     def error(self) -> float:

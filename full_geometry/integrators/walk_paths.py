@@ -375,6 +375,7 @@ class PathTracer:
         rr_depth: vertices outside after which roulette may end a path.
         hide_emitters: whether the camera sees no emitters.
         layers: whether emission that the camera sees, at once or in the mirror of an object, is also told apart.
+        begins_inside: whether the object that a path meets first does not reflect it, but lets it in or ends it.
     """
 
     visitor: LightVisitor
@@ -382,6 +383,12 @@ class PathTracer:
     rr_depth: int
     hide_emitters: bool
     layers: bool = False
+    begins_inside: bool = False
+
+    @property
+    def begins_at(self) -> mi.UInt32:
+        """The depth of the surface that does not reflect; 0, which none has, where all may."""
+        return mi.UInt32(1 if self.begins_inside else 0)
 
     def trace(
         self,
@@ -484,7 +491,7 @@ class PathTracer:
         mute = mi.Bool(False)
         if media.objects:
             bsdf = dr.select(translucent, media.boundary_pointer(near), bsdf)
-            mute = translucent & ~media.row("reflects", near)
+            mute = translucent & ((p.depth == self.begins_at) | ~media.row("reflects", near))
         lit = ~mute
         if media.inner is not None:
             around = media.inner.around(si)

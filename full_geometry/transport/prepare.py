@@ -37,7 +37,7 @@ from full_geometry.objects.objects import (
     translucent_shapes,
     with_inclusions,
 )
-from full_geometry.settings import AUTO, AUTOMATIC, Capabilities, Choices, Settings
+from full_geometry.settings import AUTO, AUTOMATIC, GATHERED, Capabilities, Choices, Settings
 from full_geometry.surface.medium_derivatives import DifferentiableTransport, MediumDerivatives
 from full_geometry.surface.translucent import MediumSpec, check_boundary
 from full_geometry.surface.varying import equivalent, warn_of_means
@@ -54,8 +54,10 @@ def _check_repeated(geometry: Geometry, spec: MediumSpec, settings: Settings) ->
     """ValueError if instances of an object are not what its model or light takes."""
     if spec.varying is not None:
         raise ValueError(f"the medium of an instance must not vary in space, got object {geometry.name}")
-    if settings.light == "gathered":
-        raise ValueError(f"light must be sampled of objects that instances show, got gathered of {geometry.name}")
+    if settings.light in GATHERED:
+        raise ValueError(
+            f"light must be sampled of objects that instances show, got {settings.light} of {geometry.name}"
+        )
     stretched = geometry.group.stretch > RIGID
     if spec.orders != "single" and stretched and not lookup(spec.model).capabilities.stretched:
         raise ValueError(
@@ -103,13 +105,14 @@ def _make_object(geometry: Geometry, spec: MediumSpec, settings: Settings) -> Tr
         _check_takes(geometry, spec, single_only)
     capabilities = lookup(spec.model).capabilities
     derivatives = MediumDerivatives(obj.surface, settings.mm_per_unit, spec.model, capabilities.derivatives)
-    if spec.orders == "total" and not single_only and not capabilities.straight:
+    corrected = settings.light == "corrected"
+    if spec.orders == "total" and not (single_only or capabilities.straight or corrected):
         check_turns(geometry, media, spec.model)
     none = ObjectModel(None, None)
     transport, proposals, entries = none if single_only else _model_of(obj, spec, settings)
     if transport and transport.orders == "total" and spec.orders == "multiple":
         raise ValueError(f"orders must be total for the model {spec.model!r}, which contains them all, got multiple")
-    low_orders = _low_orders(spec, transport)
+    low_orders = _low_orders(spec, transport, corrected)
     if transport is not None and capabilities.derivatives and obj.textured is None and obj.spectral is None:
         transport = DifferentiableTransport(transport, derivatives)
     entries = entries if settings.entries == AUTOMATIC else settings.entries
@@ -129,16 +132,18 @@ def _check_takes(geometry: Geometry, spec: MediumSpec, single_only: bool) -> Non
         )
 
 
-def _low_orders(spec: MediumSpec, transport: Transport | None) -> tuple[int, ...]:
+def _low_orders(spec: MediumSpec, transport: Transport | None, corrected: bool) -> tuple[int, ...]:
     """The orders below two that are traced beside a transport.
 
-    No light passes a half-space: its models put into orders from two on what passes something thin.
+    No light passes a half-space: its models put into orders from two on what passes something thin, which a correction
+    takes out of them.
     """
     if spec.orders != "total":
         return (1,) if spec.orders == "single" else ()
     if transport is not None and transport.orders == "total":
         return ()
-    return (0, 1) if transport is None or lookup(spec.model).capabilities.straight else (1,)
+    straight = transport is None or corrected or lookup(spec.model).capabilities.straight
+    return (0, 1) if straight else (1,)
 
 
 def _model_of(obj: TranslucentObject, spec: MediumSpec, settings: Settings) -> ObjectModel:

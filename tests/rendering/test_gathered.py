@@ -277,7 +277,9 @@ def test_derivatives_are_refused() -> None:
 
 
 def test_a_typing_mistake_is_named() -> None:
-    with pytest.raises((ValueError, RuntimeError), match="light must be one of sampled, gathered, auto, got 'gatherd'"):
+    with pytest.raises(
+        (ValueError, RuntimeError), match="light must be one of sampled, gathered, corrected, auto, got 'gatherd'"
+    ):
         _scene("gatherd")
 
 

@@ -1,0 +1,205 @@
+"""Gathered light corrected by random walks that start on the surface, the same for all views.
+
+Light L_g that a model and `gathering` give has a bias that no time lowers. With W the light of a random walk that goes
+in at x_o against w_o, both without what the boundary reflects at x_o,
+
+    L_o = L_g + a(w_o) C(x_o, w_o),    a C = E[W - L_g].
+
+C, a polynomial of the second degree of w_o bent by the boundary, is smooth where the model has the detail of light. It
+is fitted to W - L_g at random places and directions (`precomputed.surface_regression`). It stays until light or objects
+change; more walks make it finer. Walks find light precomputed where that is possible (`precomputed.unscattered_light`).
+
+Not corrected: detail that is finer than the distance of points, and C beyond its second degree in w_o.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from full_geometry.geometry.light_points import lattice, uniform_entries
+from full_geometry.geometry.points import cosine_above, place
+from full_geometry.geometry.rounding import ray_from
+from full_geometry.geometry.snapshot import Snapshot, same_objects
+from full_geometry.integrators.gathering import Gathered, light_state
+from full_geometry.integrators.surface_paths import exit_at, trace_paths
+from full_geometry.integrators.walk_paths import PathTracer
+from full_geometry.precomputed.surface_regression import ResidualSums, levels, smooth_field
+from full_geometry.precomputed.transport_matrix import bent
+from halfspace_sss.backend import clock
+
+if TYPE_CHECKING:
+    from full_geometry.objects.objects import TranslucentObject
+    from full_geometry.settings import Settings
+
+PER_LAUNCH = 2**16  # walks
+FEWEST, MOST = 2**17, 2**22  # walks of an object
+SAMPLES_PER_WALK = 8  # of the image
+LANES = 2**14
+ROOTS = 0.8566748838545029, 0.7338918566271259, 0.6287067210378087, 0.5385972572236101, 0.46140152945534  # Roberts 2018
+LEAST_ALBEDO = 1e-6
+SEED = 500
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceCorrection:
+    """C of an object.
+
+    Args:
+        gathered: light that is corrected.
+        halves: sums of independent residuals.
+        values: C at the points, (points, channels, terms).
+        error: RMS of the light over its mean, as far as `surface_regression` tells it.
+    """
+
+    gathered: Gathered
+    halves: tuple[ResidualSums, ResidualSums]
+    values: np.ndarray
+    error: float
+
+    @property
+    def walks(self) -> int:
+        """How many walks it is of."""
+        return int(sum(half.number.sum() for half in self.halves))
+
+    @classmethod
+    def of(cls, gathered: Gathered, halves: tuple[ResidualSums, ResidualSums]) -> SurfaceCorrection:
+        """The regression of residuals."""
+        points, geometry = gathered.points, gathered.object.geometry
+        p, n = (np.array(v, dtype=float).T for v in (points.p, points.n))
+        B = np.array(gathered.values, dtype=float).reshape(len(points), -1, gathered.terms)
+        G = B[:, :, 0].mean(axis=1)
+        G = (G - G.mean()) / max(float(G.std()), 1e-12 + 1e-3 * float(np.abs(G).mean()))
+        found = levels(p, n, geometry.area, float(sum(half.number.sum() for half in halves)))
+        C, squared = smooth_field(found, p, G, halves)
+        # RMS over the mean of what leaves, both over points
+        whole = np.square(B[:, :, 0] + C[:, :, 0]).sum(axis=1).mean()
+        return cls(gathered, halves, C, float(np.sqrt(squared.mean() / max(whole, 1e-30))))
+
+    @property
+    def corrected(self) -> Gathered:
+        """The light with C."""
+        values = np.array(self.values)
+        known = np.array(self.gathered.values).reshape(*values.shape[:2], self.gathered.terms)
+        values[:, :, : self.gathered.terms] += known
+        return replace(self.gathered, values=mi.Float(values.astype(np.float32).ravel()), terms=values.shape[2])
+
+    @property
+    def told(self) -> str:
+        """How many walks, and the error."""
+        name = self.gathered.object.geometry.name
+        return f"light of {name} corrected by {self.walks} walks: about {self.error:.1%} off at a point"
+
+
+class Corrections:
+    """Corrections of objects in a scene, kept until light or objects change; more walks are added to those known."""
+
+    def __init__(self) -> None:
+        self._state: Snapshot | None = None
+        self._gathered: list[Gathered] = []
+        self._known: list[SurfaceCorrection | None] = []
+        self._found: list[TranslucentObject] = []
+        self.seconds = 0.0
+
+    def of(
+        self, scene: mi.Scene, objects: list[TranslucentObject], settings: Settings, samples: int
+    ) -> list[TranslucentObject]:
+        """The objects with corrected light.
+
+        Args:
+            scene: of Mitsuba.
+            objects: with gathered light.
+            settings: of the integrator.
+            samples: of the image, by which there are walks.
+
+        Raises:
+            ValueError: the light of an object cannot be corrected.
+        """
+        # ---- what is known still holds, unless light or objects have changed
+        started, gathered, state = clock(), [obj.gathered for obj in objects], light_state(scene)
+        for obj in objects:
+            if obj.gathered is None:
+                raise ValueError(
+                    f"light of object {obj.geometry.name} must be sampled, got corrected: light leaves its model where "
+                    "it has entered"
+                )
+        if state != self._state or not same_objects(gathered, self._gathered):
+            self._state, self._gathered, self._known = state, gathered, [None] * len(objects)
+
+        # ---- walks that are missing, in two halves
+        number = int(np.clip(samples // SAMPLES_PER_WALK, FEWEST, MOST))
+        missing = [number - (0 if known is None else known.walks) for known in self._known]
+        if max(missing, default=0) > 0.1 * number:
+            tracer = _tracer(scene, settings, number)
+            for k, more in enumerate(missing):
+                before = self._known[k] or SurfaceCorrection.of(gathered[k], _nothing(gathered[k]))
+                halves, seed = list(before.halves), SEED + 10_000 * k + before.walks // PER_LAUNCH
+                for launch in range(2 * max(1, round(more / (2 * PER_LAUNCH)))):
+                    halves[launch % 2] += residuals(scene, objects, settings, tracer, k, seed + launch)
+                self._known[k] = SurfaceCorrection.of(gathered[k], tuple(halves))
+            self._found = [replace(obj, gathered=known.corrected) for obj, known in zip(objects, self._known)]
+        self.seconds = clock() - started
+        return self._found
+
+    def told(self) -> list[str]:
+        """Of each object: walks, and error."""
+        return [known.told for known in self._known if known is not None]
+
+
+def _nothing(gathered: Gathered) -> tuple[ResidualSums, ResidualSums]:
+    none = ResidualSums.zeros(len(gathered.points), dr.size_v(mi.Spectrum))
+    return none, none
+
+
+def _tracer(scene: mi.Scene, settings: Settings, number: int) -> PathTracer:
+    """Paths that go in where they begin."""
+    walk = mi.load_dict({"type": "translucent_walk", **settings.shared()})
+    return replace(walk.tracer(scene, SEED, 4 * number), begins_inside=True)
+
+
+def residuals(
+    scene: mi.Scene, objects: list[TranslucentObject], settings: Settings, tracer: PathTracer, k: int, seed: int
+) -> ResidualSums:
+    """W - L_g of object k at `PER_LAUNCH` random places and directions, summed by points.
+
+    Args:
+        scene: of Mitsuba.
+        objects: with gathered light.
+        settings: of the integrator.
+        tracer: of walks that go in where they begin.
+        k: number of the object.
+        seed: of places and walks.
+    """
+    # ---- places uniform over the area, directions by the cosine, of one lattice
+    obj, gathered = objects[k], objects[k].gathered
+    u = lattice(PER_LAUNCH, ROOTS, np.random.default_rng(seed).random(5))
+    u = [mi.Float(np.minimum(v, 1 - 2**-24).astype(np.float32)) for v in u]
+    at = uniform_entries(obj.geometry, u[0], mi.Point2f(u[1], u[2]))
+    w, _ = cosine_above(at.n_out, at.n, mi.Point2f(u[3], u[4]))
+    ray = ray_from(place(at.p, at.n), w, obj.geometry.clearance)
+    ray = mi.Ray3f(ray.o, -w)
+    si = obj.instance_scene.intersect(scene, ray, mi.RayFlags.All)
+    met, out = si.is_valid() & (si.shape == mi.ShapePtr(obj.geometry.shape)), exit_at(obj, si)
+    dr.eval(ray, out, met)
+
+    # ---- W of a walk, and L_g = a B with orders 0 and 1
+    W, _, _ = tracer.trace(ray, LANES, (seed,))
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, PER_LAUNCH)
+    parts, *_ = trace_paths(scene, objects, settings, sampler, ray, mi.Bool(True))
+    a = gathered.factor(out, met)
+    r = W - gathered.radiance(out, met) - parts[1]
+    point, near = gathered.points.nearest(out.p, out.n, met)
+    bent_w = bent(out.w, out.n_out, gathered.albedo.eta)
+    lanes = dr.zeros(mi.Float, PER_LAUNCH)
+    a, r = mi.Spectrum(a) + lanes, mi.Spectrum(r) + lanes
+    dr.eval(a, r, point, near, bent_w)
+
+    # ---- sums over the residuals of each point
+    kept = np.array(near) & (np.array(a).min(axis=0) > LEAST_ALBEDO)
+    a, r, bent_w = (np.array(v, dtype=float)[:, kept].T for v in (a, r, bent_w))
+    return ResidualSums.of(np.array(point)[kept], bent_w, a, r, len(gathered.points))

@@ -1,0 +1,151 @@
+"""Gathered light corrected by walks: the regression over a surface, means against walks, what is kept, refusals."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from full_geometry.precomputed.surface_regression import ResidualSums, levels, smooth_field
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+dr, mi = pytest.importorskip("drjit"), pytest.importorskip("mitsuba")
+
+MEDIUM = {"sigma_s": "1,1.5,2", "sigma_a": ".02,.1,.3", "g": 0.3, "eta": 1.4}
+WHITE = {"sigma_s": "1,1.5,2", "sigma_a": 0.0, "eta": 1.4}
+
+
+# ---- The regression --------------------------------------------------------------------------------------------------
+
+
+def _sphere(count: int) -> np.ndarray:
+    k = np.arange(count)
+    z, phi = 1 - 2 * (k * 0.6180339887 % 1), 2 * np.pi * (k * 0.7548776662 % 1)
+    return np.column_stack([np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z])
+
+
+def _regression(residuals: int, seed: int = 0) -> tuple[float, float]:
+    """RMS of a known field on a sphere by noisy residuals, and what is told, over the RMS of the field."""
+    rng, p = np.random.default_rng(seed), _sphere(2048)
+    G = np.where(p[:, 0] > 0.2, 1.0, 0.2)
+    constant = (0.3 + 0.2 * p[:, 2] + 0.5 * G + 0.1 * np.sin(4 * p[:, 1]))[:, None] * np.array([1.0, 0.8, 0.5])
+    halves = []
+    for _ in range(2):
+        point, w = rng.integers(0, len(p), residuals // 2), rng.normal(size=(residuals // 2, 3))
+        w *= (np.sign((w * p[point]).sum(axis=1)) / np.linalg.norm(w, axis=1))[:, None]
+        a = np.repeat(0.5 + 0.5 * (w * p[point]).sum(axis=1, keepdims=True), 3, axis=1)
+        r = a * (constant[point] + 0.1 * w[:, :1]) * rng.exponential(size=(residuals // 2, 1))
+        halves.append(ResidualSums.of(point, w, a, r, len(p)))
+    C, squared = smooth_field(levels(p, p, 4 * np.pi, residuals), p, G, (halves[0], halves[1]))
+    a = halves[0].a + halves[1].a
+    Y = a[:, 0] / a[:, :1, 0]
+    wanted = constant + 0.1 * Y[:, 1:2]
+    found = (C * Y[:, None, :]).sum(axis=2)
+    whole = np.square(wanted).sum(axis=1).mean()
+    return np.sqrt(np.square(found - wanted).sum(axis=1).mean() / whole), np.sqrt(squared.mean() / whole)
+
+
+def test_the_error_of_a_field_falls_with_the_residuals_and_is_told_within_a_factor_of_two() -> None:
+    errors = [_regression(n) for n in (2**14, 2**17, 2**20)]
+    found, told = np.array(errors).T
+    assert (found[1:] < found[:-1] / 1.25).all()
+    assert found[-1] < 0.03
+    assert ((told / found > 0.5) & (told / found < 2)).all()
+
+
+def test_sums_of_two_sets_of_residuals_are_those_of_both() -> None:
+    rng = np.random.default_rng(1)
+    point, w, a, r = rng.integers(0, 5, 60), rng.normal(size=(60, 3)), rng.random((60, 3)) + 0.1, rng.random((60, 3))
+    parts = [ResidualSums.of(point[s], w[s], a[s], r[s], 5) for s in (slice(0, 40), slice(40, 60), slice(0, 60))]
+    both, whole = parts[0] + parts[1], parts[2]
+    for x, y in ((both.number, whole.number), (both.a, whole.a), (both.r, whole.r)):
+        np.testing.assert_allclose(x, y, rtol=1e-12)
+
+
+# ---- Light -----------------------------------------------------------------------------------------------------------
+
+
+def _scene(light: str, surface: dict, lights: dict, model: str = "better_dipole", hidden: bool = True) -> Any:
+    film = {"type": "hdrfilm", "width": 12, "height": 12, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    view = mi.ScalarTransform4f().look_at([0, 0, 8], [0, 0, 0], [0, 1, 0])
+    walks = light in ("precomputed", "walk")
+    own = {"type": "translucent_walk"} if walks else {"type": "bssrdf", "light": light, "max_depth": -1}
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"mm_per_unit": 6.0, "hide_emitters": hidden, **own},
+            "sensor": {"type": "perspective", "fov": 14.0, "to_world": view, "film": film},
+            "wax": {"type": "sphere", "bsdf": {"type": "translucent", "model": model, **surface}},
+            **lights,
+        }
+    )
+
+
+def _lamp() -> dict:
+    to_world = mi.ScalarTransform4f().look_at([3, 3, 3], [0, 0, 0], [0, 1, 0]).scale(1.5)
+    lamp = {"type": "rectangle", "to_world": to_world, "emitter": {"type": "area", "radiance": 5.0}}
+    return {"lamp": lamp, "sky": {"type": "constant", "radiance": 0.3}}
+
+
+def _image(scene: Any, spp: int = 64, seed: int = 0) -> np.ndarray:
+    return np.array(mi.render(scene, spp=spp, seed=seed), dtype=float)
+
+
+def test_a_medium_without_absorption_is_invisible_in_uniform_light() -> None:
+    """All walks bring 1, what the model lacks is corrected whole."""
+    gathered, corrected = (
+        _image(_scene(light, WHITE, {"sky": {"type": "constant"}}, hidden=False), 256)
+        for light in ("gathered", "corrected")
+    )
+    assert np.abs(gathered - 1).max() > 0.1
+    assert np.abs(corrected.mean(axis=(0, 1)) - 1).max() < 0.005
+    assert np.abs(corrected - 1).max() < 0.03
+
+
+def test_it_has_the_mean_of_walks_within_1_percent_where_the_model_is_5_percent_off() -> None:
+    walks = np.array([_image(_scene("precomputed", MEDIUM, _lamp()), 2048, seed) for seed in (1, 2, 3, 4)])
+    walked, error = walks.mean(axis=(0, 1, 2)), walks.mean(axis=(1, 2)).std(axis=0, ddof=1) / 2
+    scene = _scene("corrected", MEDIUM, _lamp())
+    corrected = _image(scene, 256).mean(axis=(0, 1))
+    gathered = _image(_scene("gathered", MEDIUM, _lamp()), 256).mean(axis=(0, 1))
+    assert np.abs(gathered / walked - 1).max() > 0.05
+    assert (np.abs(corrected / walked - 1) < 0.01 + 4 * error / walked).all()
+    assert "corrected by 131072 walks" in scene.integrator().gathered[1]
+
+
+def test_walks_are_added_for_an_image_of_more_samples_and_kept_for_one_of_fewer() -> None:
+    scene = _scene("corrected", MEDIUM, _lamp())
+    walks = []
+    for spp in (16, 2**14, 16):
+        scene.integrator().prepare(scene, 144 * spp)
+        (told,) = scene.integrator().corrections.told()
+        walks.append(int(told.split("corrected by ")[1].split()[0]))
+    assert walks[0] == 2**17
+    assert walks[1] == walks[2] == pytest.approx(144 * 2**14 / 8, rel=0.3)
+
+
+def test_light_is_corrected_anew_when_an_emitter_was_edited() -> None:
+    scene = _scene("corrected", MEDIUM, _lamp())
+    before = _image(scene, 16)
+    parameters = mi.traverse(scene)
+    parameters["lamp.emitter.radiance.value"] = 0.0
+    parameters.update()
+    after = _image(scene, 16)
+    lights = {"sky": {"type": "constant", "radiance": 0.3}}
+    dark = {**_lamp(), **lights}
+    dark["lamp"]["emitter"]["radiance"] = 0.0
+    fresh = _image(_scene("corrected", MEDIUM, dark), 16)
+    assert after.mean() < 0.7 * before.mean()
+    np.testing.assert_allclose(after.mean(axis=(0, 1)), fresh.mean(axis=(0, 1)), rtol=0.01)
+
+
+def test_the_same_seed_gives_the_same_image() -> None:
+    one, two = (_image(_scene("corrected", MEDIUM, _lamp()), 16, 7) for _ in range(2))
+    np.testing.assert_allclose(one, two, rtol=1e-4, atol=1e-5)
+
+
+def test_a_diffuse_surface_is_refused_by_name() -> None:
+    with pytest.raises(ValueError, match="light of object 'wax' must be sampled, got corrected"):
+        _image(_scene("corrected", MEDIUM, _lamp(), "lambert"))
