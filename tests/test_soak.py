@@ -39,7 +39,14 @@ def _resident() -> float:
     return psutil.Process().memory_info().rss / MIB
 
 
-def _scene(rng: np.random.Generator) -> dict:
+INTEGRATORS = {
+    "bssrdf": {"type": "bssrdf", "max_depth": 4},
+    "gathered": {"type": "bssrdf", "light": "gathered"},
+    "walk": {"type": "translucent_walk"},
+}
+
+
+def _scene(rng: np.random.Generator, integrator: str) -> dict:
     """A ball of another size, medium and model over a floor, under a sky."""
     import mitsuba as mi
 
@@ -47,7 +54,7 @@ def _scene(rng: np.random.Generator) -> dict:
     at = mi.ScalarTransform4f().look_at([0, 20, 20], [0, 0, 0], [0, 0, 1])
     film = {"type": "hdrfilm", "width": 16, "height": 16}
     return {
-        "type": "scene", "integrator": {"type": "bssrdf", "max_depth": 4}, "sky": {"type": "constant"},
+        "type": "scene", "integrator": INTEGRATORS[integrator], "sky": {"type": "constant"},
         "floor": {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -4]).scale(9.0)},
         "ball": {"type": "sphere", "radius": rng.uniform(2, 4), "bsdf": {
             "type": "translucent", "albedo": ", ".join(map(str, albedo)), "sigma_t": ", ".join(map(str, sigma_t)),
@@ -56,7 +63,8 @@ def _scene(rng: np.random.Generator) -> dict:
     }  # fmt: skip
 
 
-def test_renders_of_changing_scenes_leave_no_memory_behind() -> None:
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_renders_of_changing_scenes_leave_no_memory_behind(integrator: str) -> None:
     """The mean of the last quarter against that of the second; what a process caches at first is not counted."""
     import full_geometry
 
@@ -66,7 +74,7 @@ def test_renders_of_changing_scenes_leave_no_memory_behind() -> None:
     rng, used = np.random.default_rng(1), []
     n = max(40, int(SHARE * RENDERS))
     for k in range(n):
-        scene = mi.load_dict(_scene(rng), parallel=False)
+        scene = mi.load_dict(_scene(rng, integrator), parallel=False)
         image = np.array(mi.render(scene, spp=4, seed=k))
         assert np.isfinite(image).all() and image.mean() > 0
         del scene

@@ -295,7 +295,7 @@ class LightVisitor:
         directed = mi.Bool(False)
         if self.connections is not None:
             w_0, _ = self.small.direction(which, walk.o)
-            emitter = walk.o + w_0 * dr.norm(self.scene.bbox().extents())
+            emitter = walk.o + w_0 * opaque(dr.norm(self.scene.bbox().extents()))
             active &= ~(record.connected & self.connections.covers(which, emitter, w_0, record.pivot))
             directed = active & record.directed
 

@@ -293,4 +293,4 @@ def _starts(sensor: mi.Sensor, size: float) -> np.ndarray:
     numbers = [mi.Float(row.tolist()) for row in u]
     # not sample_ray, which some sensors lack
     ray, _ = sensor.sample_ray_differential(0.0, numbers[0], mi.Point2f(*numbers[1:3]), mi.Point2f(*numbers[3:]))
-    return np.array(mi.Point3f(ray.o + ray.d * (1e-4 * size))).reshape(3, -1)
+    return np.array(mi.Point3f(ray.o + ray.d * dr.opaque(mi.Float, 1e-4 * size))).reshape(3, -1)

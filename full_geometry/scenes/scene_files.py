@@ -228,9 +228,22 @@ def _made(scene: dict | str | Path, state: ParserState, config: ParserConfig) ->
         mi.set_file_resolver(before)
 
 
+def _check_registered() -> None:
+    try:
+        mi.load_dict({"type": _INTEGRATORS[True]})
+    except RuntimeError as error:
+        if "not found" not in str(error):
+            raise
+        raise ValueError(
+            "plugins must be registered before a scene is loaded, got none: call `full_geometry.register()` after "
+            "`mitsuba.set_variant()`"
+        ) from error
+
+
 def parsed(scene: dict | str | Path, parameters: Mapping[str, str]) -> tuple[ParserState, ParserConfig]:
     """What a scene says, and how Mitsuba is to make it; ValueError if it cannot be read."""
     check_variant()
+    _check_registered()
     config = mi.parser.ParserConfig(mi.variant())
     config.parallel = False  # objects then have the same numbers each time, and kernels are found in Dr.Jit's cache
     if not isinstance(scene, dict) and not Path(scene).is_file():

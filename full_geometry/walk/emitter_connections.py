@@ -160,7 +160,7 @@ class SubpathConnections:
         flux = light * (dr.abs(dr.dot(w, sample.w_0)) / density)
         distant = self.small.distant(which)
         near = distance - before(at.p + w * distance, distance, self.small.rounding(which))
-        away = dr.select(distant, 4 * dr.norm(self.scene.bbox().extents()), near)
+        away = dr.select(distant, opaque(4 * dr.norm(self.scene.bbox().extents())), near)
         way = mi.Ray3f(mi.Point3f(at.p + w * away), -w)
         si = self.media.instance_scene.intersect(self.scene, way, mi.RayFlags.All)
         steep = dr.abs(dr.dot(w, sample.w_0)) > STEEPEST

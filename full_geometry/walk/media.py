@@ -737,4 +737,6 @@ def _bounds(scene: mi.Scene) -> mi.BoundingBox3f:
         return box
     # walks beyond it end
     margin = 1e-3 * (box.max - box.min)
-    return mi.BoundingBox3f(mi.Point3f(box.min - margin), mi.Point3f(box.max + margin))
+    low, high = mi.Point3f(box.min - margin), mi.Point3f(box.max + margin)
+    dr.make_opaque(low, high)
+    return mi.BoundingBox3f(low, high)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -67,3 +70,17 @@ def test_errors_of_other_plugins_stay_those_of_mitsuba() -> None:
     with pytest.raises(RuntimeError, match="unreferenced property") as error:
         mi.load_dict({"type": "sphere", "flop": 1})
     assert type(error.value) is RuntimeError
+
+
+def test_plugins_that_are_not_registered_are_told_by_one_sentence() -> None:
+    code = """
+import halfspace_sss, mitsuba
+mitsuba.set_variant("llvm_ad_rgb")
+from full_geometry.scenes.scene_files import load_scene
+load_scene({"type": "scene", "ball": {"type": "sphere", "bsdf": {"type": "translucent", "material": "wax"}}})
+"""
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert ended.stderr.splitlines()[-1] == (
+        "ValueError: plugins must be registered before a scene is loaded, got none: call `full_geometry.register()` "
+        "after `mitsuba.set_variant()`"
+    )
