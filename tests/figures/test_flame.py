@@ -27,6 +27,7 @@ from full_geometry.geometry.points import (  # noqa: E402
     turned,
 )
 from full_geometry.integrators.surface_paths import exit_at  # noqa: E402
+from full_geometry.learning import training  # noqa: E402
 from full_geometry.learning.model_errors import LIGHTS  # noqa: E402
 from full_geometry.learning.network_fitting import Recipe  # noqa: E402
 from full_geometry.learning.training import Trained, train  # noqa: E402
@@ -36,7 +37,7 @@ from halfspace_sss.neural.store import ENVIRONMENT_VARIABLE  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
-SIZE, BLOCKS, PASSES, SPP, LANES = 24, 3, 16, 64, 2**16
+SIZE, BLOCKS, PASSES, SPP, LANES = 24, 3, 8, 128, 2**17
 SIGNIFICANCE = 1e-3
 WALK = "path_traced"
 QUICK, CHUNKS = Recipe(width=32, depth=2, batch=1024, chunk=2**15, reuse=4), 6
@@ -59,7 +60,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory):
 
 @pytest.fixture(scope="module")
 def trained(folder: Path) -> Trained:
-    return train(mi.load_dict(mesh(folder, "wax")), WAX, chunks=CHUNKS, recipe=QUICK, folder=folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training, "WALKS", 512)  # a noisier truth than by default
+        return train(mi.load_dict(mesh(folder, "wax")), WAX, chunks=CHUNKS, recipe=QUICK, folder=folder)
 
 
 def mesh(folder: Path, name: str, **more) -> dict:
