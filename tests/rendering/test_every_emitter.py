@@ -28,7 +28,7 @@ pytestmark = pytest.mark.usefixtures("rgb")
 BUNNY = Path(__file__).parents[2] / "figures" / "assets" / "bunny.ply"
 WIDEST_Z = 4.0
 LARGEST_ERROR = 0.02  # of the mean of an image: what a comparison could still miss
-RUNS, PIXELS = 24, 6
+RUNS, PIXELS = 12, 6
 PLACE, RADIANS = np.array([1.5, 3.0, 2.5]), 0.15
 FAR = 300.0
 
@@ -125,7 +125,7 @@ def _walked(lights: dict, orders: str, fewer: int = 1) -> np.ndarray:
     """Means of images by walks that look for no emitter."""
     chance = {"type": "translucent_walk", "light": "sampled", "connection_share": 0.0}
     scene = _scene(chance, lights, orders=orders)
-    return _means(scene, (2**14 if orders == "single" else 2**11) // fewer, 1001)
+    return _means(scene, (2**15 if orders == "single" else 2**12) // fewer, 1001)
 
 
 @cache
@@ -160,13 +160,13 @@ KINDS = ("area", "constant", "envmap", "point", "directional", "sunsky")  # a sp
 def test_walks_find_the_light_of_every_emitter(kind: str) -> None:
     """All orders."""
     scene = _scene({"type": "translucent_walk"}, _lights(kind))
-    _agree(_means(scene, 2**9, 1), _reference(kind, "total"))
+    _agree(_means(scene, 2**10, 1), _reference(kind, "total"))
 
 
 @pytest.mark.parametrize("kind", _slowly(*KINDS))
 def test_the_single_order_beside_models_is_that_of_walks_for_emitters_of_each_kind(kind: str) -> None:
     scene = _scene({"type": "bssrdf"}, _lights(kind), orders="single", model="better_dipole")
-    _agree(_means(scene, 2**9, 201), _reference(kind, "single"))  # one image of 120 has a firefly of a point light
+    _agree(_means(scene, 2**10, 201), _reference(kind, "single"))  # one image of 120 has a firefly of a point light
 
 
 def _same_light_otherwise(kind: str) -> dict:
@@ -199,7 +199,7 @@ def _model_finds_all_light(kind: str, model: str) -> None:
     """The light of a model is linear in what arrives; what the model itself is off by cancels."""
     surface = {"orders": "multiple", "model": model}
     found, wanted = (
-        _means(_scene({"type": "bssrdf"}, lights, **surface), 2**8, seed)
+        _means(_scene({"type": "bssrdf"}, lights, **surface), 2**9, seed)
         for lights, seed in ((_lights(kind), 1), (_same_light_otherwise(kind), 1001))
     )
     _agree(found, wanted)
@@ -222,7 +222,7 @@ def test_light_of_two_emitters_is_the_sum_of_that_of_each(one: str, other: str, 
     lights = [EMITTERS[kind]() for kind in (one, other)]
     scenes = [{"first": lights[0]}, {"second": lights[1]}, {"first": lights[0], "second": lights[1]}]
     found = [
-        _means(_scene({"type": integrator}, each, orders=orders, model="better_dipole"), 2**9, 500 * k)
+        _means(_scene({"type": integrator}, each, orders=orders, model="better_dipole"), 2**10, 500 * k)
         for k, each in enumerate(scenes)
     ]
     _agree(found[2], found[0] + found[1])
@@ -259,7 +259,7 @@ def test_models_of_an_object_find_the_light_of_a_delta_light_and_of_a_sun(kind: 
 def test_models_of_an_object_have_the_light_of_walks_within_their_error(trained: np.ndarray) -> None:
     """Orders from two on, under an even sky."""
     scene = _scene({"type": "bssrdf"}, {"sky": {"type": "constant"}}, orders="multiple", model="full_geometry")
-    found, walked = _means(scene, 2**7, 1), _reference("constant", "multiple")
+    found, walked = _means(scene, 2**8, 1), _reference("constant", "multiple")
     ratio = found.mean(axis=0) / walked.mean(axis=0)
     noise = [x.std(axis=0, ddof=1) / np.sqrt(len(x)) / x.mean(axis=0) for x in (found, walked)]
     assert (np.abs(ratio - 1) < trained + WIDEST_Z * np.hypot(*noise)).all()
@@ -314,7 +314,7 @@ def test_walks_in_a_cube_under_a_point_light_are_within_a_percent_of_a_ball_of_l
     """All orders, as above; of a smaller sphere `test_walks_find_the_light_of_every_emitter` knows it."""
     ball = {"light": _ball(PLACE, _flux("point"), 0.05)}
     lamp = _under_a_point_light("cube")
-    found = [_means(scene, 2**11, seed).mean(axis=1) for scene, seed in ((lamp, 1), (lamp | ball, 101))]
+    found = [_means(scene, 2**12, seed).mean(axis=1) for scene, seed in ((lamp, 1), (lamp | ball, 101))]
     mean, error = found[1].mean(), np.hypot(*(x.std(ddof=1) / np.sqrt(len(x)) for x in found))
     assert error < 0.005 * mean
     assert abs(found[0].mean() / mean - 1) < 0.01
