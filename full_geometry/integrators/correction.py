@@ -96,9 +96,17 @@ class SurfaceCorrection:
 
 
 class Corrections:
-    """Corrections of objects in a scene, kept until light or objects change; more walks are added to those known."""
+    """Corrections of objects in a scene, kept until light or objects change; more walks are added to those known.
 
-    def __init__(self) -> None:
+    Args:
+        part: of walks that are independent of other parts.
+
+    Attributes:
+        seconds: by `clock`, of the walks as they were last traced.
+    """
+
+    def __init__(self, part: int = 0) -> None:
+        self._part = part
         self._state: Snapshot | None = None
         self._gathered: list[Gathered] = []
         self._known: list[SurfaceCorrection | None] = []
@@ -137,12 +145,13 @@ class Corrections:
             tracer = _tracer(scene, settings, number)
             for k, more in enumerate(missing):
                 before = self._known[k] or SurfaceCorrection.of(gathered[k], _nothing(gathered[k]))
-                halves, seed = list(before.halves), SEED + 10_000 * k + before.walks // PER_LAUNCH
+                halves = list(before.halves)
+                seed = SEED + 10_000 * k + 1_000_000 * self._part + before.walks // PER_LAUNCH
                 for launch in range(2 * max(1, round(more / (2 * PER_LAUNCH)))):
                     halves[launch % 2] += residuals(scene, objects, settings, tracer, k, seed + launch)
                 self._known[k] = SurfaceCorrection.of(gathered[k], tuple(halves))
             self._found = [replace(obj, gathered=known.corrected) for obj, known in zip(objects, self._known)]
-        self.seconds = clock() - started
+            self.seconds = clock() - started
         return self._found
 
     def told(self) -> list[str]:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.trade.assessing import assess
 from full_geometry.trade.results import UNNAMED, Assessment, ObjectTrade, TechniqueTrade, html_table, samples_for
-from full_geometry.trade.techniques import GATHERED, LAMBERT, PRECOMPUTED_WALKS, Job, Technique
+from full_geometry.trade.techniques import CORRECTED, GATHERED, LAMBERT, PRECOMPUTED_WALKS, Job, Technique
 from halfspace_sss.noise_free import short
 
 if TYPE_CHECKING:
@@ -128,7 +128,12 @@ def advise(assessment: Assessment, job: Job) -> Advice:
     """The ways for a job, from what has been measured."""
     objects = tuple(_object(o, job) for o in assessment.objects)
     told = [o for o in objects if o.way is not None]
-    kinds = (INTEGRATOR, f"{INTEGRATOR}, {GATHERED}", PATH_TRACED, PRECOMPUTED_WALKS.name)
+    kinds = (
+        INTEGRATOR,
+        *(f"{INTEGRATOR}, {light}" for light in (GATHERED, CORRECTED)),
+        PATH_TRACED,
+        PRECOMPUTED_WALKS.name,
+    )
     times = {kind: sum(_best(o, kind) for o in told) for kind in kinds}
     integrator = min(times, key=lambda kind: times[kind])
     return Advice(objects, integrator, times[integrator], assessment, job.tolerance)
@@ -140,7 +145,8 @@ def _best(advice: ObjectAdvice, kind: str) -> float:
     def served(technique: Technique) -> bool:
         if technique.walks or kind.startswith(PATH_TRACED):
             return technique.name == kind
-        return technique.model == LAMBERT or (technique.light == GATHERED) == kind.endswith(GATHERED)
+        light = kind.removeprefix(INTEGRATOR).removeprefix(", ") or "sampled"
+        return technique.light == light or (technique.model == LAMBERT and light != CORRECTED)
 
     return min((o.seconds for o in advice.options if o.way and served(Technique.of(o.way))), default=math.inf)
 

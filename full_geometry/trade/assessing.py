@@ -136,7 +136,7 @@ def _assessed_for(
     on: Stage, chosen: Sequence[Technique], job: Job, effort: Effort, every: bool, progress: NamedProgress | None
 ) -> Assessment:
     dear = DEAR if effort.seconds < DEAR_SECONDS else ()
-    later = [t for t in chosen if not every and (t.light == GATHERED or t.model in dear)]
+    later = [t for t in chosen if not every and (t.gathers or t.model in dear)]
     ahead = [t for t in chosen if t not in later]
     exits = effort.exits if every else min(effort.exits, MOST)
     samples = SceneSamples.of(on, ahead, replace(effort, exits=exits))

@@ -26,6 +26,7 @@ from full_geometry.trade.advice import Advice, advise
 from full_geometry.trade.assessing import CANDIDATES, DOUBT, assess_for, assess_stage
 from full_geometry.trade.results import ObjectTrade, TechniqueTrade
 from full_geometry.trade.techniques import (
+    CORRECTED,
     GATHERED,
     LAMBERT,
     WALKS,
@@ -100,7 +101,7 @@ def _read(path: Path) -> dict[str, Any]:
         record = json.loads(path.read_text(encoding="utf-8"))
         models, sentences = ([str(name) for name in record[key]] for key in ("models", "sentences"))
         known = record["format"] == FORMAT and all(name in model_names() and name != AUTO for name in models)
-        known &= record["light"] in ("sampled", GATHERED) and len(models) == len(sentences)
+        known &= record["light"] in ("sampled", GATHERED, CORRECTED) and len(models) == len(sentences)
         known &= isinstance(record["refusal"], str)
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} must be the record of a choice, got {error!r}; delete it to choose anew") from error

@@ -39,7 +39,7 @@ from full_geometry.trade.statistics import (
     relative_variance,
     with_prior,
 )
-from full_geometry.trade.techniques import GATHERED, PRECOMPUTED, RAYS, WALKS, Effort, Stage, Technique
+from full_geometry.trade.techniques import PRECOMPUTED, RAYS, WALKS, Effort, Stage, Technique
 from halfspace_sss.backend import clock
 from halfspace_sss.progress import NamedProgress
 
@@ -133,14 +133,14 @@ class SceneSamples:
     ) -> None:  # fmt: skip
         on, sampled = self.on, self.sampled[k]
         samples, end = budget.samples, clock() + budget.seconds
-        ordered = sorted(chosen, key=lambda each: each.light != GATHERED)  # the others share what gathered light leaves
+        ordered = sorted(chosen, key=lambda each: not each.gathers)  # the others share what gathered light leaves
         sampled |= {technique: [] for technique in chosen if technique not in sampled}
         for done, technique in enumerate(ordered):
             tell(technique.name, done)
             if isinstance(sampled[technique], str):
                 continue
             share = budget.traced if technique.exact and len(chosen) > 1 else 1 / (len(chosen) - done)
-            if technique.light == GATHERED and len(chosen) > 1 and not samples:
+            if technique.gathers and len(chosen) > 1 and not samples:
                 share = min(share, GATHERED_SHARE)
             for half, part in enumerate(on.runs(technique)):
                 started = clock()
@@ -253,7 +253,7 @@ def _mfp(on: Stage, k: int) -> tuple[float, float]:
 
 def _part_of(on: Stage, technique: Technique, run: Technique, budget: RunBudget) -> float:
     """The share of a run in the time of its technique; few samples tell what gathered light costs."""
-    own = 0.0 if technique.light == GATHERED else budget.own
+    own = 0.0 if technique.gathers else budget.own
     if on.smoothed is None:
         return 1 / len(technique.halves)
     return (1 - own) / len(technique.halves) if run.smoothed else own
@@ -269,7 +269,7 @@ def _begun(
     if half == 1 and run.part:  # what the first part took longer to prepare was compilation
         sampled[0].compiling += max(sampled[0].preparing - result.preparing, 0.0)
     sampled.append(result)
-    return result, result.compiling + (0.0 if half or run.light != GATHERED else result.preparing)
+    return result, result.compiling + (0.0 if half or not run.gathers else result.preparing)
 
 
 def _of_cost(on: Stage, technique: Technique, sampled: list[Sampled]) -> list[Sampled]:

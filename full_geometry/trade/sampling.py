@@ -16,6 +16,8 @@ from full_geometry.geometry.instances import InstanceScene, bounds_of
 from full_geometry.geometry.rounding import ray_from
 from full_geometry.geometry.sensors import independent, seeded
 from full_geometry.integrators.bssrdf import is_bssrdf
+from full_geometry.integrators.correction import FEWEST as FEWEST_WALKS
+from full_geometry.integrators.correction import SAMPLES_PER_WALK
 from full_geometry.integrators.gathering import PART
 from full_geometry.integrators.translucent_walk import SAMPLES_PER_RAY
 from full_geometry.precomputed.transport_matrix import R_2
@@ -23,7 +25,7 @@ from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.settings import variant_channels
 from full_geometry.surface.wrapped import surface_of
 from full_geometry.trade.statistics import RadianceEstimate
-from full_geometry.trade.techniques import GATHERED, PRECOMPUTED, RAYS, Stage, Technique
+from full_geometry.trade.techniques import CORRECTED, PRECOMPUTED, RAYS, Stage, Technique
 from halfspace_sss.backend import clock
 
 LANES = 2**18  # of a launch
@@ -45,6 +47,7 @@ class Sampled:
         compiling: the same by `clock`.
         overhead: seconds of a launch whatever its samples: its paths are recorded, and their kernel is found again.
         launches: (samples of all exits, seconds) of each launch that compiled nothing.
+        beside: seconds of walks that a sample brings along, of corrected light.
         memory: most bytes that Dr.Jit held while it ran.
         blur: of walks in a scene with delta lights, what of their light is blurred, see `sample_blur`.
     """
@@ -55,6 +58,7 @@ class Sampled:
     compilation: float = 0.0
     compiling: float = 0.0
     overhead: float = 0.0
+    beside: float = 0.0
     memory: int = 0
     launches: list[tuple[int, float]] = field(default_factory=list)
     blur: RadianceEstimate | None = None
@@ -62,7 +66,7 @@ class Sampled:
     @property
     def seconds(self) -> float:
         """Seconds of one sample, the least of all launches, without the overhead of a launch, as images are larger."""
-        return min(max(took - self.overhead, LEAST_SHARE * took) / n for n, took in self.launches)
+        return self.beside + min(max(took - self.overhead, LEAST_SHARE * took) / n for n, took in self.launches)
 
 
 def first_sample(
@@ -79,12 +83,14 @@ def first_sample(
     started = clock()
     _prepare(stage, technique)
     preparation = preparing = clock() - started
-    if technique.light == GATHERED and technique.part:  # of all samples, after what parts and whole have in common
+    if technique.gathers and technique.part:  # of all samples, after what parts and whole have in common
         made, light = stage.integrator(technique).gathering.seconds
         preparation = max(preparing - made - light, 0.0) + made / PART + 2 * light
         same = stage.paces.get((object, replace(technique, light="sampled", part=0)))  # which made the objects for both
         preparation += same.preparation if same else 0.0
     result = Sampled(RadianceEstimate(variant_channels(), exits.n), preparation, preparing)
+    if technique.light == CORRECTED:  # larger images have more walks
+        result.beside = stage.integrator(technique).corrections.seconds / (FEWEST_WALKS * SAMPLES_PER_WALK)
     _first_launch(stage, technique, exits, result, each, seeded(seed, 31))
     stage.paces[object, technique] = result
     return result

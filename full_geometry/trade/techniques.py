@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.integrators.bssrdf import is_bssrdf
+from full_geometry.integrators.correction import Corrections
 from full_geometry.integrators.gathering import Gathering
 from full_geometry.objects.objects import KnowsUnit, millimetres, refuse_instances, translucent_shapes
 from full_geometry.objects.small_emitters import is_delta
@@ -22,8 +23,8 @@ from full_geometry.settings import AUTO, check_variant
 from full_geometry.transport.models import model_names
 from halfspace_sss.checks import check_choice, check_count, check_interval
 
-LAMBERT = "lambert"
-GATHERED, PRECOMPUTED = "gathered", "precomputed"
+LAMBERT, READY_FIRST = "lambert", "better_dipole"
+GATHERED, CORRECTED, PRECOMPUTED = "gathered", "corrected", "precomputed"
 RAYS = 2**19  # of light precomputed for walks, for each object: its noise at a point is 3 to 8 %
 
 
@@ -33,7 +34,8 @@ class Technique:
 
     Args:
         model: name of a model, or "path_traced": walks.
-        light: "sampled"; of models "gathered", see `Settings`; of walks "precomputed", see `unscattered_light`.
+        light: "sampled"; of models "gathered" or "corrected", see `Settings`; of walks "precomputed", see
+            `unscattered_light`.
         part: of gathered light, see `Gathering`, 0 for all of it; of precomputed light one independent of other parts.
         blur: of walks, see `translucent_walk`.
         smoothed: whether by the smoothed environment, see `SmoothedEnvironment`.
@@ -55,6 +57,11 @@ class Technique:
         return self.walks and self.light == "sampled"
 
     @property
+    def gathers(self) -> bool:
+        """Whether light is gathered before the first sample."""
+        return self.light in (GATHERED, CORRECTED)
+
+    @property
     def halves(self) -> tuple[Technique, ...]:
         """The techniques that it is measured by: itself, or two independent parts of gathered or precomputed light."""
         return (self,) if self.light == "sampled" else (replace(self, part=1), replace(self, part=2))
@@ -73,7 +80,7 @@ class Technique:
         """The technique of that name; ValueError if there is none."""
         model, _, light = name.partition(", ")
         check_choice("way", model, (PATH_TRACED, *(m for m in model_names() if m != AUTO)))
-        known = {PATH_TRACED: (PRECOMPUTED,), LAMBERT: ()}.get(model, (GATHERED,))
+        known = {PATH_TRACED: (PRECOMPUTED,), LAMBERT: ()}.get(model, (GATHERED, CORRECTED))
         if light:
             check_choice(f"light of {model}", light, known)
         return cls(model, light or "sampled")
@@ -84,11 +91,11 @@ PRECOMPUTED_WALKS = Technique(PATH_TRACED, light=PRECOMPUTED)
 
 
 def techniques() -> list[Technique]:
-    """All of them: path traced first, with light sampled and precomputed, a diffuse surface, and every model with light
-    sampled and gathered."""
+    """All of them: path traced first, with light sampled and precomputed, a diffuse surface, every model with light
+    sampled and gathered, and the one that is ready first with light corrected."""
     names = [name for name in model_names() if name not in (AUTO, LAMBERT)]
     results = [WALKS, PRECOMPUTED_WALKS, Technique(LAMBERT), *map(Technique, names)]
-    return results + [Technique(name, light=GATHERED) for name in names]
+    return [*results, *(Technique(name, light=GATHERED) for name in names), Technique(READY_FIRST, light=CORRECTED)]
 
 
 @dataclass(eq=False)
@@ -161,6 +168,7 @@ class Stage:
             self._integrators[technique] = mi.load_dict(plugin)
             if technique.part and not technique.walks:
                 self._integrators[technique].gathering = Gathering(technique.part)
+                self._integrators[technique].corrections = Corrections(technique.part)
             sampled = self._integrators.get(replace(technique, light="sampled", part=0))
             # spectral variants refuse gathered light
             if technique.light == GATHERED and sampled is not None and not mi.is_spectral:

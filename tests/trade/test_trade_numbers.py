@@ -259,14 +259,14 @@ def test_a_bias_that_contradicts_what_was_known_is_told_as_measured() -> None:
 
 @pytest.mark.parametrize(
     "way",
-    ["path_traced", "path_traced, precomputed", "neural", "neural, gathered"],
+    ["path_traced", "path_traced, precomputed", "neural", "neural, gathered", "neural, corrected"],
 )
 def test_a_way_comes_back_by_its_name(way: str) -> None:
     assert Technique.of(way).name == way
 
 
 @pytest.mark.parametrize(
-    "unknown", ["lambert, gathered", "neural, collected", "neural, precomputed", "path_traced, gathered"]
+    "unknown", ["lambert, gathered", "lambert, corrected", "neural, collected", "neural, precomputed", "path_traced, gathered"]
 )  # fmt: skip
 def test_a_way_that_does_not_exist_is_refused(unknown: str) -> None:
     with pytest.raises(ValueError, match="light of"):

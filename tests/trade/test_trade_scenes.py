@@ -248,6 +248,16 @@ def test_precomputed_light_of_walks_has_less_variance_and_no_bias_beside_its_noi
     assert row.variance + 4 * row.variance_error < 0.5 * found.traced.variance
 
 
+def test_corrected_light_has_a_fifth_of_the_bias_of_gathered_light_at_most() -> None:
+    thin, models = {"sigma_s": 2.0, "sigma_a": 0.02}, ["better_dipole, gathered", "better_dipole, corrected"]
+    gathered, corrected = (
+        assess(scene(thin), models=models, flip=False, samples=512, exits=64).objects[0].way(name) for name in models
+    )
+    assert gathered.bias2 > 0.15**2
+    assert np.sqrt(max(corrected.bias2 - 3 * corrected.bias2_error, 0)) < np.sqrt(gathered.bias2) / 5
+    assert corrected.preparation > gathered.preparation
+
+
 def test_walks_refuse_to_precompute_light_where_that_cannot_be() -> None:
     ways = [WALKS, PRECOMPUTED_WALKS]
     found = assess_stage(stage(scene(orders="multiple")), ways, Effort(samples=48, exits=32)).objects[0]
