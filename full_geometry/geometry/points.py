@@ -137,6 +137,11 @@ def opaque(value: float) -> mi.Float:
     return dr.opaque(mi.Float, float(value))
 
 
+def of_rows(kind: type, rows: np.ndarray) -> mi.Vector3f | mi.Spectrum:
+    """A vector or colour of n lanes from an array (n, size): its parts are arrays, so that n is in no kernel."""
+    return kind(*(mi.Float(np.ascontiguousarray(v, dtype=np.float32)) for v in rows.T))
+
+
 def channel_mean(value: mi.Spectrum) -> mi.Float:
     """Mean over the channels of a colour.
 

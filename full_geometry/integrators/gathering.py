@@ -22,7 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.geometry.light_points import GOLDEN, SurfacePoints
-from full_geometry.geometry.points import cosine_above, opaque, place
+from full_geometry.geometry.points import cosine_above, of_rows, opaque, place
 from full_geometry.geometry.rounding import blocked, ray_from
 from full_geometry.geometry.snapshot import Snapshot, same_objects
 from full_geometry.integrators.inner_light import COUNT, inner_light
@@ -320,7 +320,7 @@ def _incident(
 
     # ---- Σ L and Σ L (bent w - middle) over the directions of each row
     around = T.around
-    centre = dr.gather(mi.Vector3f, mi.Vector3f(around.middle.T.astype(np.float32)), point)
+    centre = dr.gather(mi.Vector3f, of_rows(mi.Vector3f, around.middle), point)
     d_e, d_c = (bent(w, at.n_out, T.albedo.eta) - centre for w in (w_e, w_c))
     values = [aimed + met, *(aimed * d_e[i] + met * d_c[i] for i in range(3))]
     values += [TRACED * more, *(TRACED * more * d_c[i] for i in range(3)), TRACED * dr.select(on, a, 0)]

@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.geometry.light_points import GOLDEN
-from full_geometry.geometry.points import EntrySample, SurfacePoint
+from full_geometry.geometry.points import EntrySample, SurfacePoint, of_rows
 
 if TYPE_CHECKING:
     from full_geometry.objects.objects import TranslucentObject
@@ -112,7 +112,8 @@ class EntryPairs(NamedTuple):
         # the exit along w_o, the entry with light along w
         obj, on = self.object, mi.Bool(True)
         w_o = self.w_o[lit.row, lit.number % self.w_o.shape[1]]
-        row, number, w_o, w = mi.UInt32(lit.row), mi.UInt32(lit.number), mi.Vector3f(w_o.T), mi.Vector3f(lit.w.T)
+        row, number = mi.UInt32(lit.row), mi.UInt32(lit.number)
+        w_o, w = (of_rows(mi.Vector3f, v) for v in (w_o, lit.w))
         entry = self.entries(number)
         at, prepared = entry.facing(w), obj.transport.prepare(self.out(row, w_o)[0], on)
 

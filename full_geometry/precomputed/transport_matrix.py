@@ -48,7 +48,16 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.geometry.light_points import GOLDEN, REACH, SurfacePoints
-from full_geometry.geometry.points import EntrySample, SurfacePoint, cosine_above, evaluate, opaque, wrapped
+from full_geometry.geometry.points import (
+    EntrySample,
+    SurfacePoint,
+    channel_mean,
+    cosine_above,
+    evaluate,
+    of_rows,
+    opaque,
+    wrapped,
+)
 from full_geometry.precomputed.entries import PLACES, StratifiedEntries
 from full_geometry.precomputed.point_pairs import EntryPairs, Rays, lit_pairs
 from halfspace_sss.physics.fresnel import F_t
@@ -170,7 +179,7 @@ class Hemispheres(NamedTuple):
         a = albedo(cosine(w, n, n_out)) * dr.pi
 
         # sums over directions of a, of a w and of a w w^T, w bent by the boundary
-        weight, w = dr.mean(a), bent(w, n_out, albedo.eta)
+        weight, w = channel_mean(a), bent(w, n_out, albedo.eta)
         values = [*a, *(weight * w), *(weight * w[i] * w[k] for i in range(3) for k in range(3)), weight]
         dr.eval(values)  # once for all sums
         sums = [dr.block_sum(v, LATTICE) for v in values]
@@ -746,7 +755,7 @@ def _rows(
 
     # Σ S / Σ alpha, smoothed more, as alpha has the detail
     j = mi.UInt32(np.repeat(np.arange(len(points), dtype=np.uint32), found.exits))
-    out, face = points.exit_along(j, mi.Vector3f(found.w_o[:, : found.exits].reshape(-1, 3).T))
+    out, face = points.exit_along(j, of_rows(mi.Vector3f, found.w_o[:, : found.exits].reshape(-1, 3)))
     alpha = np.array(obj.transport.alpha(obj.knowing(out, face), mi.Bool(True))[1], dtype=np.float32)
     known = found.S.mean(axis=1) / np.maximum(alpha.T.reshape(len(points), found.exits, -1).mean(axis=1), 1e-30)
     for _ in range(KNOWN_ROUNDS):

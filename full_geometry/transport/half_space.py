@@ -197,7 +197,7 @@ def straight_share(geometry: Geometry, media: Sequence[Medium]) -> np.ndarray:
     n = dr.select(dr.dot(met.n, entered.d) > 0, -met.n, met.n)
     d, _, valid = refract_in(surface_point(met.p, n, n, -entered.d), opaque(media[0].eta))
     valid &= met.is_valid()
-    left = meet_alone(geometry.scene, ray_from(met, d, geometry.rounding), flags, valid)
+    left = meet_alone(geometry.scene, ray_from(met, d, geometry.clearance), flags, valid)
     ways = np.array(left.t)[np.array(valid)] * (1 if geometry.group is None else geometry.group.scale)
     reduced = [float(m.sigma_t - max(m.g, 0.0) * m.sigma_s) for m in media]
     return np.array([np.exp(-k * ways).mean() if len(ways) else 0.0 for k in reduced])
