@@ -52,7 +52,7 @@ class SurfaceCorrection:
     Args:
         gathered: light that is corrected.
         halves: sums of independent residuals.
-        values: C at the points, (points, channels, terms).
+        values: C at the points times `scale_of` the light, (points, channels, terms).
         error: RMS of the light over its mean, as far as `surface_regression` tells it.
     """
 
@@ -76,14 +76,14 @@ class SurfaceCorrection:
         G = (G - G.mean()) / max(float(G.std()), 1e-12 + 1e-3 * float(np.abs(G).mean()))
         found = levels(p, n, geometry.area, float(sum(half.number.sum() for half in halves)))
         C, squared = smooth_field(found, p, G, halves)
-        # RMS over the mean of what leaves, both over points
-        whole = np.square(B[:, :, 0] + C[:, :, 0]).sum(axis=1).mean()
-        return cls(gathered, halves, C, float(np.sqrt(squared.mean() / max(whole, 1e-30))))
+        # RMS over points, over the mean of all light that leaves, which no walk has told yet where it is 0
+        whole = np.square((halves[0] + halves[1]).mean).sum()
+        return cls(gathered, halves, C, float(np.sqrt(squared.mean() / whole)) if whole > 0 else 0.0)
 
     @property
     def corrected(self) -> Gathered:
         """The light with C."""
-        values = np.array(self.values)
+        values = self.values / scale_of(self.gathered)[:, None]
         known = np.array(self.gathered.values).reshape(*values.shape[:2], self.gathered.terms)
         values[:, :, : self.gathered.terms] += known
         return replace(self.gathered, values=mi.Float(values.astype(np.float32).ravel()), terms=values.shape[2])
@@ -92,7 +92,7 @@ class SurfaceCorrection:
     def told(self) -> str:
         """How many walks, and the error."""
         name = self.gathered.object.geometry.name
-        return f"light of {name} corrected by {self.walks} walks: about {self.error:.1%} off at a point"
+        return f"light of object {name} corrected by {self.walks} walks: about {self.error:.1%} off at a point"
 
 
 class Corrections:
@@ -205,10 +205,17 @@ def residuals(
     point, near = gathered.points.nearest(out.p, out.n, met)
     bent_w = bent(out.w, out.n_out, gathered.albedo.eta)
     lanes = dr.zeros(mi.Float, PER_LAUNCH)
-    a, r = mi.Spectrum(a) + lanes, mi.Spectrum(r) + lanes
-    dr.eval(a, r, point, near, bent_w)
+    a, r, W = mi.Spectrum(a) + lanes, mi.Spectrum(r) + lanes, mi.Spectrum(W) + lanes
+    dr.eval(a, r, W, point, near, bent_w)
 
     # ---- sums over the residuals of each point
     kept = np.array(near) & (np.array(a).min(axis=0) > LEAST_ALBEDO)
-    a, r, bent_w = (np.array(v, dtype=float)[:, kept].T for v in (a, r, bent_w))
-    return ResidualSums.of(np.array(point)[kept], bent_w, a, r, len(gathered.points))
+    a, r, W, bent_w = (np.array(v, dtype=float)[:, kept].T for v in (a, r, W, bent_w))
+    a = a / scale_of(gathered)
+    return ResidualSums.of(np.array(point)[kept], bent_w, a, r, W, len(gathered.points))
+
+
+def scale_of(gathered: Gathered) -> np.ndarray:
+    """Mean of a(w) mu of each channel over that of all, by which residuals of all channels are alike."""
+    whole = np.maximum(gathered.albedo.whole, LEAST_ALBEDO)
+    return whole / whole.mean()

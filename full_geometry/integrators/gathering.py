@@ -200,7 +200,7 @@ class Gathering:
     def told(self) -> list[str]:
         """Of each object: points, memory, and noise."""
         results = [obj.gathered for obj in self._found if obj.gathered is not None]
-        return [f"light of {g.object.geometry.name} {g.told}" for g in results]
+        return [f"light of object {g.object.geometry.name} {g.told}" for g in results]
 
 
 def spreads(obj: TranslucentObject) -> bool:

@@ -50,20 +50,28 @@ class ResidualSums:
         number: of residuals, (points,).
         a: Σ a Y Y^T, (points, terms, terms).
         r: Σ a Y r / a, (points, terms, channels).
+        light: Σ of the light that residuals are a part of, (channels,).
     """
 
     number: np.ndarray
     a: np.ndarray
     r: np.ndarray
+    light: np.ndarray
 
     @classmethod
     def zeros(cls, points: int, channels: int) -> ResidualSums:
         """Of no residuals."""
-        return cls(np.zeros(points), np.zeros((points, TERMS, TERMS)), np.zeros((points, TERMS, channels)))
+        return cls(np.zeros(points), np.zeros((points, TERMS, TERMS)), np.zeros((points, TERMS, channels)),
+                   np.zeros(channels))  # fmt: skip
 
     @classmethod
-    def of(cls, point: np.ndarray, w: np.ndarray, a: np.ndarray, r: np.ndarray, points: int) -> ResidualSums:
-        """Of residuals r (n, channels) in directions w (n, 3) at points; their factors a (n, channels) are above 0."""
+    def of(
+        cls, point: np.ndarray, w: np.ndarray, a: np.ndarray, r: np.ndarray, light: np.ndarray, points: int
+    ) -> ResidualSums:  # fmt: skip
+        """Of residuals r (n, channels) of light (n, channels) in directions w (n, 3) at points.
+
+        Their factors a (n, channels) are above 0.
+        """
         # a is the mean over the channels, so that all have the same weights
         weight = a.mean(axis=1)
         phi = np.stack(directional(*w.T), axis=1)
@@ -71,10 +79,16 @@ class ResidualSums:
         right = ((weight[:, None] * r / a)[:, None, :] * phi[:, :, None]).reshape(len(w), -1)
         at = csr_array((np.ones(len(w)), (point, np.arange(len(w)))), shape=(points, len(w)))
         number = np.bincount(point, minlength=points).astype(float)
-        return cls(number, (at @ outer).reshape(points, TERMS, TERMS), (at @ right).reshape(points, TERMS, -1))
+        return cls(number, (at @ outer).reshape(points, TERMS, TERMS), (at @ right).reshape(points, TERMS, -1),
+                   light.sum(axis=0))  # fmt: skip
 
     def __add__(self, other: ResidualSums) -> ResidualSums:
-        return ResidualSums(self.number + other.number, self.a + other.a, self.r + other.r)
+        return ResidualSums(*(getattr(self, name) + getattr(other, name) for name in ("number", "a", "r", "light")))
+
+    @property
+    def mean(self) -> np.ndarray:
+        """Σ light / Σ a, (channels,)."""
+        return self.light / max(float(self.a[:, 0, 0].sum()), 1e-30)
 
 
 def size_of(p: np.ndarray) -> float:

@@ -37,7 +37,7 @@ def _regression(residuals: int, seed: int = 0) -> tuple[float, float]:
         w *= (np.sign((w * p[point]).sum(axis=1)) / np.linalg.norm(w, axis=1))[:, None]
         a = np.repeat(0.5 + 0.5 * (w * p[point]).sum(axis=1, keepdims=True), 3, axis=1)
         r = a * (constant[point] + 0.1 * w[:, :1]) * rng.exponential(size=(residuals // 2, 1))
-        halves.append(ResidualSums.of(point, w, a, r, len(p)))
+        halves.append(ResidualSums.of(point, w, a, r, r, len(p)))
     C, squared = smooth_field(levels(p, p, 4 * np.pi, residuals), p, G, (halves[0], halves[1]))
     a = halves[0].a + halves[1].a
     Y = a[:, 0] / a[:, :1, 0]
@@ -58,9 +58,11 @@ def test_the_error_of_a_field_falls_with_the_residuals_and_is_told_within_a_fact
 def test_sums_of_two_sets_of_residuals_are_those_of_both() -> None:
     rng = np.random.default_rng(1)
     point, w, a, r = rng.integers(0, 5, 60), rng.normal(size=(60, 3)), rng.random((60, 3)) + 0.1, rng.random((60, 3))
-    parts = [ResidualSums.of(point[s], w[s], a[s], r[s], 5) for s in (slice(0, 40), slice(40, 60), slice(0, 60))]
+    parts = [
+        ResidualSums.of(point[s], w[s], a[s], r[s], r[s] + 1, 5) for s in (slice(0, 40), slice(40, 60), slice(0, 60))
+    ]
     both, whole = parts[0] + parts[1], parts[2]
-    for x, y in ((both.number, whole.number), (both.a, whole.a), (both.r, whole.r)):
+    for x, y in ((both.number, whole.number), (both.a, whole.a), (both.r, whole.r), (both.mean, whole.mean)):
         np.testing.assert_allclose(x, y, rtol=1e-12)
 
 

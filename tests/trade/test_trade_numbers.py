@@ -266,7 +266,8 @@ def test_a_way_comes_back_by_its_name(way: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "unknown", ["lambert, gathered", "lambert, corrected", "neural, collected", "neural, precomputed", "path_traced, gathered"]
+    "unknown",
+    ["lambert, gathered", "lambert, corrected", "neural, collected", "neural, precomputed", "path_traced, gathered"],
 )  # fmt: skip
 def test_a_way_that_does_not_exist_is_refused(unknown: str) -> None:
     with pytest.raises(ValueError, match="light of"):
