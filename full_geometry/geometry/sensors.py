@@ -31,6 +31,13 @@ def independent(seed: int, n: int) -> mi.Sampler:
     return sampler
 
 
+def checked_samples(sensor: mi.Sensor, spp: int) -> int:
+    """Samples of a pixel: spp, or those of the sampler where spp is 0; ValueError below that."""
+    if spp < 0:
+        raise ValueError(f"spp must be at least 1, or 0 for the samples of the sampler, got {spp}")
+    return spp or sensor.sampler().sample_count()
+
+
 def camera_rays(sensor: mi.Sensor, spp: int, seed: tuple[int, int]) -> tuple[mi.Ray3f, mi.Spectrum, mi.Vector2f]:
     """`rays_by` the sampler of the sensor."""
     return rays_by(sensor, seeded_sampler(sensor, spp, seeded(*seed)))

@@ -16,6 +16,7 @@ import mitsuba as mi
 from full_geometry.geometry import mesh
 from full_geometry.geometry.instances import InstanceScene
 from full_geometry.geometry.sensors import (
+    checked_samples,
     past_emitters,
     path_numbers,
     rays_by,
@@ -119,7 +120,7 @@ def _class(variant: str) -> type:
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             with interruptible(), undisturbed(), dr.suspend_grad():
                 # ---- the objects, and proposals for their entries by the light
-                samples = (spp or sensor.sampler().sample_count()) * int(dr.prod(sampled_size(sensor.film())))
+                samples = checked_samples(sensor, spp) * int(dr.prod(sampled_size(sensor.film())))
                 objects = self.prepare(scene, samples)
                 for obj in objects:
                     if obj.spectral is not None:
@@ -153,7 +154,7 @@ def _class(variant: str) -> type:
             if self._objects.choices.light in GATHERED:
                 return objects
             # the more samples an image has, the more are spent on where light arrives
-            spp, pixels = spp or sensor.sampler().sample_count(), int(dr.prod(sensor.film().crop_size()))
+            spp, pixels = checked_samples(sensor, spp), int(dr.prod(sensor.film().crop_size()))
             proposals = self._lit_entries.of(scene, objects, self.settings, spp * pixels)
             return [replace(obj, proposals=given) for obj, given in zip(objects, proposals)]
 
@@ -258,7 +259,7 @@ def launches(sensor: mi.Sensor, spp: int) -> Iterator[Launch]:
     Only samples of the sampler `independent` are split, as those of `path_numbers` go on in the next launch. Other
     samplers round the samples of each launch up to a square or another number of strata: they have one launch.
     """
-    spp = spp or sensor.sampler().sample_count()
+    spp = checked_samples(sensor, spp)
     # n launches of about `SAMPLES_PER_LAUNCH`, the first and last sample of each
     n = min(math.ceil(spp * int(dr.prod(sensor.film().crop_size())) / SAMPLES_PER_LAUNCH), spp)
     ends = [(spp * k) // n for k in range(n + 1)] if is_independent(sensor.sampler()) else [0, spp]

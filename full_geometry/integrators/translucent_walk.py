@@ -11,7 +11,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from full_geometry.geometry.sensors import camera_rays, sampled_size, splat, widened
+from full_geometry.geometry.sensors import camera_rays, checked_samples, sampled_size, splat, widened
 from full_geometry.geometry.shape import SceneMark
 from full_geometry.geometry.snapshot import Snapshot, same_objects
 from full_geometry.integrators.gathering import light_state
@@ -165,7 +165,7 @@ def _class(variant: str) -> type:
         ) -> mi.TensorXf | None:  # fmt: skip
             """The image; `keep` is called with the first exits of each launch, which are stored for it."""
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-            spp = spp or sensor.sampler().sample_count()
+            spp = checked_samples(sensor, spp)
             with interruptible(), dr.suspend_grad():
                 seed = int(mi.UInt32(seed)[0])
                 samples = spp * int(dr.prod(sampled_size(sensor.film())))
@@ -240,7 +240,7 @@ def _class(variant: str) -> type:
                 raise ValueError(f"derivatives must be of an RGB or mono variant, got {mi.variant()}")
             _check_followed(scene)
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-            spp = spp or sensor.sampler().sample_count()
+            spp = checked_samples(sensor, spp)
             with interruptible():
                 _render(self.tracer(scene, scored=True), sensor, int(mi.UInt32(seed)[0]), spp, None, True)
                 with dr.resume_grad():

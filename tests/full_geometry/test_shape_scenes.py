@@ -93,6 +93,12 @@ def test_it_warns_by_name_and_number_out_of_its_range(ball: dict, surface: dict,
     assert any(re.search(words, str(w.message)) for w in caught)
 
 
+def test_it_warns_of_a_clear_object_by_its_mean_chord() -> None:
+    """4/3 of the radius of 3: in grapefruit juice it was 1.13 of walks under a lamp, without a word."""
+    with pytest.warns(UserWarning, match="object 'ball' is clear for neural_shape.*mean chord is 2.6, 2.6, 2.6 transp"):
+        mi.render(load_scene(scene(sigma_s=0.6, sigma_a=0.05)), spp=1)
+
+
 def test_within_its_range_it_says_nothing() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -84,3 +84,15 @@ load_scene({"type": "scene", "ball": {"type": "sphere", "bsdf": {"type": "transl
         "ValueError: plugins must be registered before a scene is loaded, got none: call `full_geometry.register()` "
         "after `mitsuba.set_variant()`"
     )
+
+
+@pytest.mark.parametrize("integrator", ["bssrdf", "translucent_walk"])
+def test_a_number_of_samples_below_zero_is_refused(integrator: str) -> None:
+    """0 is Mitsuba's word for the samples of the sampler; -1 gave a black image."""
+    film = {"type": "hdrfilm", "width": 2, "height": 2}
+    view = mi.ScalarTransform4f().look_at([0, 0, 9], [0, 0, 0], [0, 1, 0])
+    ball = {"type": "sphere", "bsdf": {"type": "translucent", "sigma_t": 20.0, "albedo": 0.9, "model": "lambert"}}
+    sensor = {"type": "perspective", "to_world": view, "film": film}
+    scene = mi.load_dict({"type": "scene", "integrator": {"type": integrator}, "ball": ball, "sensor": sensor})
+    with pytest.raises(ValueError, match="^spp must be at least 1, or 0 for the samples of the sampler, got -1"):
+        mi.render(scene, spp=-1)
