@@ -66,7 +66,7 @@ def _pictures(light: str, g: float) -> tuple[np.ndarray, np.ndarray]:
     """Three images with light at events traced, and three with that light gathered; orders 0 and 1 are much of it."""
     found = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(prepare, "_low_orders", lambda inside, _: (0, 1))
+        patch.setattr(prepare, "_low_orders", lambda *_: (0, 1))
         for traces, spp in ((True, 1024), (False, 64)):
             patch.setattr(gathering, "has_inner_light", (lambda _: False) if traces else inner.has_inner_light)
             scene = _scene(_lights(light), g=g)
