@@ -130,11 +130,7 @@ class Corrections:
         # ---- what is known still holds, unless light or objects have changed
         started, gathered, state = clock(), [obj.gathered for obj in objects], light_state(scene)
         for obj in objects:
-            if obj.gathered is None:
-                raise ValueError(
-                    f"light of object {obj.geometry.name} must be sampled, got corrected: light leaves its model where "
-                    "it has entered"
-                )
+            _check(obj)
         if state != self._state or not same_objects(gathered, self._gathered):
             self._state, self._gathered, self._known = state, gathered, [None] * len(objects)
 
@@ -157,6 +153,14 @@ class Corrections:
     def told(self) -> list[str]:
         """Of each object: walks, and error."""
         return [known.told for known in self._known if known is not None]
+
+
+def _check(obj: TranslucentObject) -> None:
+    """ValueError if there is no light of an object to correct, or walks would not all go in where they begin."""
+    reason = "it leaves the model where it has entered" if obj.gathered is None else ""
+    reason = "the surface has a mask or is blended with another" if obj.wrapping.mixes else reason
+    if reason:
+        raise ValueError(f"light of object {obj.geometry.name} must be sampled, got corrected: {reason}")
 
 
 def _nothing(gathered: Gathered) -> tuple[ResidualSums, ResidualSums]:
@@ -207,6 +211,9 @@ def residuals(
     lanes = dr.zeros(mi.Float, PER_LAUNCH)
     a, r, W = mi.Spectrum(a) + lanes, mi.Spectrum(r) + lanes, mi.Spectrum(W) + lanes
     dr.eval(a, r, W, point, near, bent_w)
+
+    if not dr.all(dr.isfinite(dr.sum(r)))[0]:
+        raise ValueError(f"light of walks at object {obj.geometry.name} must be finite, got NaN or infinity")
 
     # ---- sums over the residuals of each point
     kept = np.array(near) & (np.array(a).min(axis=0) > LEAST_ALBEDO)

@@ -79,7 +79,10 @@ def _scene(light: str, surface: dict, lights: dict, model: str = "better_dipole"
             "type": "scene",
             "integrator": {"mm_per_unit": 6.0, "hide_emitters": hidden, **own},
             "sensor": {"type": "perspective", "fov": 14.0, "to_world": view, "film": film},
-            "wax": {"type": "sphere", "bsdf": {"type": "translucent", "model": model, **surface}},
+            "wax": {
+                "type": "sphere",
+                "bsdf": {"type": "translucent", **({} if "type" in surface else {"model": model}), **surface},
+            },
             **lights,
         }
     )
@@ -149,5 +152,13 @@ def test_the_same_seed_gives_the_same_image() -> None:
 
 
 def test_a_diffuse_surface_is_refused_by_name() -> None:
-    with pytest.raises(ValueError, match="light of object 'wax' must be sampled, got corrected"):
+    with pytest.raises(ValueError, match="light of object 'wax' must be sampled, got corrected: it leaves"):
         _image(_scene("corrected", MEDIUM, _lamp(), "lambert"))
+
+
+def test_a_surface_with_a_mask_is_refused_by_name() -> None:
+    inner = {"type": "translucent", "model": "better_dipole", **MEDIUM}
+    with pytest.raises(
+        ValueError, match="light of object 'wax' must be sampled, got corrected: the surface has a mask"
+    ):
+        _image(_scene("corrected", {"type": "mask", "opacity": 0.5, "inner": inner}, _lamp()))
