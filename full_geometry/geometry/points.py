@@ -231,7 +231,9 @@ def lift(si: mi.SurfaceInteraction3f, w: mi.Vector3f, active: mi.Bool = True) ->
     """The interaction with the frame that w sees, a direction in the world that becomes its `wi`."""
     c = dr.dot(si.sh_frame.n, w)
     below = active & (c * dr.dot(si.n, w) < 0)
-    frame = mi.Frame3f(dr.select(below, si.sh_frame.n - 2 * c * w, si.sh_frame.n))
+    n = dr.select(below, si.sh_frame.n - 2 * c * w, si.sh_frame.n)
+    s = dr.normalize(si.sh_frame.s - n * dr.dot(n, si.sh_frame.s))  # rough boundaries are told apart by their axes
+    frame = mi.Frame3f(s, dr.cross(n, s), n)
     si.sh_frame = dr.select(below, frame, si.sh_frame)
     si.wi = dr.select(below, frame.to_local(w), si.wi)
     return si

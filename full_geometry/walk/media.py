@@ -617,11 +617,12 @@ class WalkMedia:
         if all(obj.upright for obj in self.objects) and not self.any_bent:
             return si
 
-        # the geometric normal outwards, the shading normal on the same side, and wi in the new frame
+        # the geometric normal outwards, the shading frame on the same side, turned about the first axis of a rough
+        # boundary, and wi in it
         n = dr.select(k >= 0, si.n * self.side(dr.maximum(k, 0), si.prim_index), si.n)
         flip = (k >= 0) & (dr.dot(si.sh_frame.n, n) < 0)
-        si.n, n = n, si.sh_frame.n
-        si.sh_frame = dr.select(flip, mi.Frame3f(-n), si.sh_frame)
+        si.n, frame = n, si.sh_frame
+        si.sh_frame = dr.select(flip, mi.Frame3f(frame.s, -frame.t, -frame.n), frame)
         si.wi = si.to_local(-direction)
         return si
 

@@ -52,6 +52,22 @@ def test_a_direction_below_the_horizon_sees_a_normal_as_far_above_it():
     assert np.allclose(np.array(lifted(m, n, mi.Vector3f(n))), np.array(m))
 
 
+def test_the_axes_of_a_rough_boundary_tilt_with_the_normal_that_is_seen():
+    """Along x, by far less than 45 degrees; new axes from the normal alone are along its own x and y."""
+    from full_geometry.geometry.points import lift
+
+    si, w = dr.zeros(mi.SurfaceInteraction3f), dr.normalize(mi.Vector3f(-0.95, 0.1, 0.2))
+    m = dr.normalize(mi.Normal3f(0.3, 0.1, 1))
+    s = dr.normalize(dr.cross(mi.Vector3f(1, -1, 0), m))  # across the diagonal
+    si.n, si.sh_frame = mi.Normal3f(0, 0, 1), mi.Frame3f(s, dr.cross(m, s), m)
+    si.wi = si.to_local(w)
+    seen = lift(mi.SurfaceInteraction3f(si), w)
+    assert dr.dot(m, w)[0] < 0 < mi.Frame3f.cos_theta(seen.wi)[0]
+    assert dr.dot(seen.sh_frame.s, s)[0] > 0.97
+    assert np.allclose(np.array(seen.to_world(seen.wi)), np.array(w), atol=1e-6)
+    assert dr.dot(dr.cross(seen.sh_frame.s, seen.sh_frame.t), seen.sh_frame.n)[0] == pytest.approx(1, abs=1e-6)
+
+
 def test_directions_are_above_the_surface_and_of_the_density_that_is_stated():
     """Mean of 1/density is the solid angle 2 pi of all directions above, of cos²/density its integral 2 pi / 3."""
     from full_geometry.geometry.points import cosine_above, cosine_density
