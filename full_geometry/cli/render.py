@@ -133,7 +133,7 @@ def render(
             which = {"seed": images.seed, "sensor": k, **transport.training()}
             result = _rendered(loaded, file, limits, which, images.resume)
             emission = result.mean[..., -3:] if getattr(loaded.integrator(), "layers", False) else None
-            told, error = _numbers(result), _error(result)
+            told, error = _numbers(result), _error(result, limits.target_error or SMALL_ERROR)
             picture = Picture(
                 title=file.stem, image=_colours(result.mean), numbers=told, caption=error, scene=loaded, sensor=k,
                 denoise=images.denoise, emission=emission,
@@ -299,7 +299,11 @@ def _numbers(reference: Reference) -> dict[str, str]:
     return {"samples": str(reference.spp), "time, s": f"{reference.seconds:.3g}", "relative error": told}
 
 
-def _error(reference: Reference) -> str:
+SMALL_ERROR = 0.01  # below which nobody has to know where the noise of an image is from
+
+
+def _error(reference: Reference, wanted: float = SMALL_ERROR) -> str:
+    """What an image says of its noise; where from only if there is more of it than was wanted."""
     if not reference.mean[..., :3].any():
         return "every pixel is black: no light reaches the camera"
     if reference.passes < 2:
@@ -307,7 +311,7 @@ def _error(reference: Reference) -> str:
     if reference.relative_error == 0:
         return "all passes are the same: the camera sees nothing that varies, such as the sky alone"
     told, share = f"relative standard error of the image {reference.relative_error:.2%}", reference.share_by_chance
-    if not share or share < 0.005:
+    if not share or share < 0.005 or reference.relative_error <= wanted:
         return told
     return (
         f"{told}; up to {share:.0%} of the variance is from light that scattered at most once inside and then hit an "

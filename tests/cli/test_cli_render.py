@@ -236,17 +236,25 @@ def test_one_pass_claims_no_error(scene: Path) -> None:
     assert "inf" not in result.stdout + result.stderr
 
 
-@pytest.mark.parametrize(("share", "told"), [(0.0, False), (0.004, False), (0.3, True)])
-def test_light_met_by_chance_is_told_in_a_sentence_where_it_is_a_share_of_the_noise(share: float, told: bool) -> None:
+@pytest.mark.parametrize(
+    ("share", "error", "wanted", "told"),
+    [(0.0, 0.1, 0.01, False), (0.004, 0.1, 0.01, False), (0.3, 0.1, 0.01, True), (0.3, 0.0026, 0.01, False),
+     (0.3, 0.0026, 0.001, True)],
+)  # fmt: skip
+def test_light_met_by_chance_is_told_in_a_sentence_where_it_is_a_share_of_noise_that_matters(
+    share: float, error: float, wanted: float, told: bool
+) -> None:
     from full_geometry.cli.render import _error
     from full_geometry.scenes.reference_store import BY_CHANCE, Reference
 
     image = np.full((2, 2, 3), 1.0)
-    whole = 4 * 3 * 0.01  # of the variance of all pixels
+    whole = 4 * 3 * error**2  # of the variance of all pixels
     about = {BY_CHANCE: share * whole * 8**2}
-    known = Reference(mean=image, variance=0.01 * image, passes=2, spp=8, seconds=1.0, about=about)
+    known = Reference(mean=image, variance=error**2 * image, passes=2, spp=8, seconds=1.0, about=about)
     sentence = "; up to 30% of the variance is from light that scattered at most once inside and then hit an emitter by"
-    assert (sentence in _error(known)) == told and "variance" not in _error(known).replace(sentence, "")
+    found = _error(known, wanted)
+    assert f"error of the image {error:.2%}" in found
+    assert (sentence in found) == told and "variance" not in found.replace(sentence, "")
 
 
 @pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
