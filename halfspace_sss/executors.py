@@ -20,13 +20,14 @@ from typing import TYPE_CHECKING, TypeVar
 
 import halfspace_sss
 from halfspace_sss.backend import BackendError, cores, limit_threads
-from halfspace_sss.checks import check_count
+from halfspace_sss.checks import check_count, check_interval
 
 if TYPE_CHECKING:
     from distributed import Worker
 
 R = TypeVar("R")
 LOCAL = "local"  # in place of an address: a cluster of Dask on this machine
+MOST_WORKERS = 1024
 _PROCESS = os.getpid()  # that imported this module: a forked child has another one
 
 
@@ -100,9 +101,10 @@ def workers(number: int) -> Iterator[Executor]:
         number: of processes.
 
     Raises:
-        ValueError: the number is not above 0.
+        ValueError: the number is not in [1, MOST_WORKERS].
     """
     check_count("workers", number, 1)
+    check_interval("workers", number, 1, MOST_WORKERS)
     threads = max(cores() // number, 1)
     context = multiprocessing.get_context("spawn")
     before = set(multiprocessing.active_children())

@@ -80,6 +80,8 @@ def test_a_forked_process_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_what_is_no_number_of_workers_and_no_scheduler_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ValueError, match="workers must be a whole number >= 1, got 0"), executors.workers(0):
         pass
+    with pytest.raises(ValueError, match=r"workers must be a number in \[1, 1024\], got 2281362504"):
+        executors.workers(2281362504).__enter__()
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(BackendError, match=r"pip install \"halfspace-sss\[cluster\]\""), executors.scheduler("x"):
         pass
