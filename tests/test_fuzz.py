@@ -32,7 +32,7 @@ COMPUTES = [  # what is replaced: the properties are of what comes before the co
     "halfspace_sss.comparison.reflectance_curves.trace_curve", "halfspace_sss.maps.map_store.trace_unit",
     "halfspace_sss.comparison.model_errors.references", "halfspace_sss.neural.train",
     "halfspace_sss.neural.training.train_universal.train_universal",
-    "halfspace_sss.comparison.truths.validate",
+    "halfspace_sss.comparison.truths.validate", "halfspace_sss.comparison.model_truths.reflectance_truths",
     "full_geometry.scenes.reference.render",
     "figures.parts.runner.completed_plans",
     "full_geometry.trade.flat.references", "full_geometry.trade.assessing.assess_stage",
