@@ -31,8 +31,11 @@ def test_the_noise_of_the_reference_is_taken_off() -> None:
 def test_precomputed_light_comes_nearer_to_the_reference_in_more_time(tmp_path: Path) -> None:
     from benchmarks.speeds import LitObject
 
-    how = module.TotalErrors((1.0, 8.0), 10.0, 32)
+    how = module.TotalErrors((0.5, 4.0), 6.0, 32)
     table = module.total_errors([LitObject("hand of potato", "windows")], how, tmp_path, lambda *about: None)
-    found = table[table["way"] == "walk, light precomputed, raw"]
+    found, corrected = (
+        table[table["way"] == f"{way}, raw"] for way in ("walk, light precomputed", "better_dipole, light corrected")
+    )
     assert found["pixels, %"].iloc[1] < 0.7 * found["pixels, %"].iloc[0]
-    assert (np.abs(found[["mean R", "mean G", "mean B"]].iloc[1] - 1) < 0.03).all()
+    for rows in (found, corrected):
+        assert (np.abs(rows[["mean R", "mean G", "mean B"]].iloc[1] - 1) < 0.03).all()

@@ -74,7 +74,7 @@ def test_the_figure_its_page_and_its_table_are_drawn(results: dict[str, Result])
 def test_denoising_brings_a_noisy_image_nearer_to_the_truth() -> None:
     pytest.importorskip("mitsuba_oidn")
     fig11.prepare()
-    albedo, normal = guides(contender("standard_dipole", "marble", 32, "even sky"), 8)
+    albedo, normal = guides(contender("standard_dipole", "marble", 32, "even sky"))
     assert (albedo.max(axis=(0, 1)) < 0.95).all() and np.ptp(albedo.max(axis=(0, 1))) > 0.02  # of marble, not the cover
     clean = 0.5 * albedo
     noisy = clean * np.random.default_rng(0).exponential(1.0, clean.shape)
