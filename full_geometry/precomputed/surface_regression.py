@@ -7,15 +7,15 @@ polynomials of w up to the second degree (`directional`). About each of K centre
 
 G a feature of points that C may follow, as light that was gathered there, W_cj = (1 - d² / h²)² max(n_c.n_j, 0)². The
 weight a keeps the sum of the residuals about each centre. The fits of all centres in reach are blended by the same
-weights W_cj. Level 0 is one fit of all points, each further level has four times as many centres as the one before. C
-is the sum of what each level adds to the coarser one,
+weights W_cj. Level 0 is one fit of all points, each further level has four times as many centres as the one before and
+fits what the coarser ones leave. C is the sum of what each level adds,
 
-    C = C^(0) + Σ_l kappa_l (C^(l) - C^(l-1)),    kappa_l = S[d_1 d_2] / S[(d_1 + d_2)² / 4],
+    C = C^(0) + Σ_l kappa_l d^(l),    kappa_l = S[d_1 d_2] / S[(d_1 + d_2)² / 4],
 
-d_1 and d_2 what it adds by two independent halves of the residuals, S a mean over the neighbourhood: the Wiener filter,
-as E[d_1 d_2] is the square of the field alone. So finer levels come in as residuals become many. The mean squared error
+d_1 and d_2 of two independent halves of the residuals, S a mean over the neighbourhood: the Wiener filter, as
+E[d_1 d_2] is the square of the field alone. So finer levels come in as residuals become many. The mean squared error
 
-    Σ_l (1 - kappa_l)² S[d_1 d_2] + (C_1 - C_2)² / 4
+    (1 - kappa)² S[d_1 d_2] of the finest level + (C_1 - C_2)² / 4
 
 is what the filter takes away and the noise of the mean of C_1 and C_2, which the halves have apart; detail that no
 level has is not in it. Moon et al. (2014) and Bitterli et al. (2016) regress so over pixels.
@@ -23,7 +23,7 @@ level has is not in it. Moon et al. (2014) and Bitterli et al. (2016) regress so
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -33,8 +33,9 @@ from scipy.spatial import cKDTree
 FIRST_CENTRES, FACTOR = 16, 4
 REACH = 2.0  # h over the mean distance of centres
 RIDGE = 0.001  # of the sum of weights, on all but the constant; features are of the order of one
+NOISE = 20.0  # more of it for each residual: their variance over that of coefficients
 TERMS = 9  # of `directional`
-LEAST_OF_LEVEL = 12  # residuals for each centre of a level, on average
+LEAST_OF_LEVEL = 24  # residuals for each centre of a level, on average
 
 
 def directional(x: Any, y: Any, z: Any) -> list[Any]:
@@ -126,8 +127,8 @@ class Level:
         w = np.square((1 - (d.data / h) ** 2) * np.maximum((n[c] * n[j]).sum(axis=1), 0))
         return cls(np.arange(count), h, size_of(p), csr_array((w, (c, j)), shape=(count, len(p))))
 
-    def fitted(self, features: np.ndarray, sums: ResidualSums) -> tuple[np.ndarray, np.ndarray]:
-        """C at all points, (points, terms, channels), and where a centre is in reach.
+    def fitted(self, features: np.ndarray, sums: ResidualSums) -> np.ndarray:
+        """C at all points, (points, terms, channels); 0 where no centre is in reach.
 
         Args:
             features: (points, 1 + U), 1 and x / size and G of each point.
@@ -159,7 +160,8 @@ class Level:
         # ---- beta = (M + ridge)^-1 v, of phi again; centres without residuals have 0
         M, v = T @ M @ np.swapaxes(T, 1, 2), T @ v
         whole = M[:, 0, 0]
-        M += np.where(whole > 0, whole, 1)[:, None, None] * np.diag([1e-9] + [RIDGE] * (D - 1))
+        ridge = RIDGE + NOISE / np.maximum(W @ sums.number, 1)
+        M += (np.where(whole > 0, whole, 1) * ridge)[:, None, None] * np.diag([1e-6] + [1.0] * (D - 1))
         beta = np.swapaxes(T, 1, 2) @ np.linalg.solve(M, v)
 
         # ---- C_j = Σ_c W_cj (beta.phi_j) / Σ_c W_cj
@@ -167,7 +169,7 @@ class Level:
         total = np.asarray(known.sum(axis=1)).ravel()
         beta = (known @ beta.reshape(K, -1)).reshape(N, D, -1) / np.maximum(total, 1e-30)[:, None, None]
         constant = (features[:, :, None] * beta[:, :U]).sum(axis=1, keepdims=True)
-        return np.concatenate([constant, beta[:, U:]], axis=1), total > 0
+        return np.concatenate([constant, beta[:, U:]], axis=1)
 
     def averaged(self, x: np.ndarray) -> np.ndarray:
         """The mean of a value of points (points,) over the neighbourhood: to the centres and back."""
@@ -207,20 +209,16 @@ def smooth_field(
 
     # ---- one fit of all points, then what each level adds, filtered
     features = np.column_stack([np.ones(len(p)), (p - p.mean(axis=0)) / size_of(p), G])
-    before = [of[0].fitted(features, half)[0] for half in halves]
-    C, lost = list(before), np.zeros(len(p))
+    C, lost = [of[0].fitted(features, half) for half in halves], np.zeros(len(p))
     for k, level in enumerate(of[1:]):
-        now = [level.fitted(features, half) for half in halves]
-        reached = now[0][1] & now[1][1]
-        now = [np.where(reached[:, None, None], C_now, C_before) for (C_now, _), C_before in zip(now, before)]
-        d = [C_now - C_before for C_now, C_before in zip(now, before)]
+        left = [replace(half, r=half.r - half.a @ C_half) for half, C_half in zip(halves, C)]
+        d = [level.fitted(features, half) for half in left]
         wide = of[max(k - 1, 0)]
         signal = np.maximum(wide.averaged((value(d[0]) * value(d[1])).sum(axis=1)), 0)
         power = wide.averaged(np.square(value(d[0] + d[1]) / 2).sum(axis=1))
         kappa = np.minimum(signal / np.maximum(power, 1e-30), 1)
         C = [C_half + kappa[:, None, None] * more for C_half, more in zip(C, d)]
-        lost += (1 - kappa) ** 2 * signal
-        before = now
+        lost = (1 - kappa) ** 2 * signal
 
     # ---- squared error: what the filter loses, and the noise of the mean of both halves
     error = lost + 0.25 * np.square(value(C[0] - C[1])).sum(axis=1)
