@@ -53,22 +53,24 @@ class SurfaceCorrection:
     Args:
         gathered: light that is corrected.
         halves: sums of independent residuals.
+        launches: of walks that they are of.
         values: C at the points times `scale_of` the light, (points, channels, terms).
         error: RMS of the light over its mean, as far as `surface_regression` tells it.
     """
 
     gathered: Gathered
     halves: tuple[ResidualSums, ResidualSums]
+    launches: int
     values: np.ndarray
     error: float
 
     @property
     def walks(self) -> int:
-        """How many walks it is of."""
+        """How many walks it is of, without those whose place is not on the object or has no point near it."""
         return int(sum(half.number.sum() for half in self.halves))
 
     @classmethod
-    def of(cls, gathered: Gathered, halves: tuple[ResidualSums, ResidualSums]) -> SurfaceCorrection:
+    def of(cls, gathered: Gathered, halves: tuple[ResidualSums, ResidualSums], launches: int) -> SurfaceCorrection:
         """The regression of residuals."""
         points, geometry = gathered.points, gathered.object.geometry
         p, n = (np.array(v, dtype=float).T for v in (points.p, points.n))
@@ -77,9 +79,9 @@ class SurfaceCorrection:
         G = (G - G.mean()) / max(float(G.std()), 1e-12 + 1e-3 * float(np.abs(G).mean()))
         found = levels(p, n, geometry.area, float(sum(half.number.sum() for half in halves)))
         C, squared = smooth_field(found, p, G, halves)
-        # RMS over points, over the mean of all light that leaves, which no walk has told yet where it is 0
+        # RMS over points, over the mean of all light that leaves
         whole = np.square((halves[0] + halves[1]).mean).sum()
-        return cls(gathered, halves, C, float(np.sqrt(squared.mean() / whole)) if whole > 0 else 0.0)
+        return cls(gathered, halves, launches, C, float(np.sqrt(squared.mean() / whole)) if whole > 0 else 0.0)
 
     @property
     def corrected(self) -> Gathered:
@@ -137,16 +139,15 @@ class Corrections:
 
         # ---- walks that are missing, in two halves
         number = int(np.clip(samples // SAMPLES_PER_WALK, FEWEST, MOST))
-        missing = [number - (0 if known is None else known.walks) for known in self._known]
-        if max(missing, default=0) > 0.1 * number:
+        launches = 2 * round(number / (2 * PER_LAUNCH))
+        if any(known is None or known.launches < launches for known in self._known):
             tracer = _tracer(scene, settings, number)
-            for k, more in enumerate(missing):
-                before = self._known[k] or SurfaceCorrection.of(gathered[k], _nothing(gathered[k]))
-                halves = list(before.halves)
-                seed = SEED + 10_000 * k + 1_000_000 * self._part + before.walks // PER_LAUNCH
-                for launch in range(2 * max(1, round(more / (2 * PER_LAUNCH)))):
-                    halves[launch % 2] += residuals(scene, objects, settings, tracer, k, seed + launch)
-                self._known[k] = SurfaceCorrection.of(gathered[k], tuple(halves))
+            for k, known in enumerate(self._known):
+                first, halves = (known.launches, list(known.halves)) if known else (0, _nothing(gathered[k]))
+                for launch in range(first, launches):
+                    seed = SEED + 10_000 * k + 1_000_000 * self._part + launch
+                    halves[launch % 2] += residuals(scene, objects, settings, tracer, k, seed)
+                self._known[k] = SurfaceCorrection.of(gathered[k], tuple(halves), launches)
             self._found = [replace(obj, gathered=known.corrected) for obj, known in zip(objects, self._known)]
             self.seconds = clock() - started
         return self._found
@@ -164,9 +165,8 @@ def _check(obj: TranslucentObject) -> None:
         raise ValueError(f"light of object {obj.geometry.name} must be sampled, got corrected: {reason}")
 
 
-def _nothing(gathered: Gathered) -> tuple[ResidualSums, ResidualSums]:
-    none = ResidualSums.zeros(len(gathered.points), dr.size_v(mi.Spectrum))
-    return none, none
+def _nothing(gathered: Gathered) -> list[ResidualSums]:
+    return [ResidualSums.zeros(len(gathered.points), dr.size_v(mi.Spectrum))] * 2
 
 
 def _tracer(scene: mi.Scene, settings: Settings, number: int) -> PathTracer:

@@ -131,6 +131,25 @@ def test_walks_are_added_for_an_image_of_more_samples_and_kept_for_one_of_fewer(
     assert walks[1] == walks[2] == pytest.approx(144 * 2**14 / 8, rel=0.3)
 
 
+def test_walks_that_are_added_have_seeds_of_their_own_however_many_were_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    from full_geometry.integrators import correction
+
+    seeds = []
+
+    def few(*arguments: Any) -> ResidualSums:
+        seeds.append(arguments[-1])
+        points = len(arguments[1][0].gathered.points)
+        return ResidualSums.of(
+            np.zeros(9, int), np.ones((9, 3)), np.ones((9, 3)), np.ones((9, 3)), np.ones((9, 3)), points
+        )
+
+    monkeypatch.setattr(correction, "residuals", few)
+    scene = _scene("corrected", MEDIUM, _lamp())
+    for spp, launches in ((16, 2), (16, 2), (2**14, 4), (2**14, 4), (2**15, 8)):
+        scene.integrator().prepare(scene, 144 * spp)
+        assert len(seeds) == len(set(seeds)) == launches
+
+
 def test_light_is_corrected_anew_when_an_emitter_was_edited() -> None:
     scene = _scene("corrected", MEDIUM, _lamp())
     before = _image(scene, 16)
