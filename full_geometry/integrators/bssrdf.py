@@ -31,7 +31,7 @@ from full_geometry.integrators.lit_entries import LitEntries
 from full_geometry.integrators.surface_paths import replay_paths, trace_paths
 from full_geometry.objects.objects import KnowsUnit, TranslucentObject
 from full_geometry.objects.small_emitters import check_emitters
-from full_geometry.settings import GATHERED, Choices, Settings, read_settings
+from full_geometry.settings import GATHERED_LIGHTS, Choices, Settings, read_settings
 from full_geometry.surface.translucent import is_translucent
 from full_geometry.surface.wrapped import wraps
 from full_geometry.transport.prepare import Chooser, TranslucentObjects, choices_of, make_objects
@@ -96,7 +96,7 @@ def _class(variant: str) -> type:
 
         def _prepared(self, scene: mi.Scene, samples: int = 0) -> list[TranslucentObject]:
             objects, light = self._objects.of(scene), self._objects.choices.light
-            if light not in GATHERED:
+            if light not in GATHERED_LIGHTS:
                 return objects
             objects = self.gathering.of(scene, objects, self.settings)
             return self.corrections.of(scene, objects, self.settings, samples) if light == "corrected" else objects
@@ -151,7 +151,7 @@ def _class(variant: str) -> type:
             self, scene: mi.Scene, objects: list[TranslucentObject], sensor: mi.Sensor, spp: int
         ) -> list[TranslucentObject]:
             """The objects with entries drawn by light, where that pays."""
-            if self._objects.choices.light in GATHERED:
+            if self._objects.choices.light in GATHERED_LIGHTS:
                 return objects
             # the more samples an image has, the more are spent on where light arrives
             spp, pixels = checked_samples(sensor, spp), int(dr.prod(sensor.film().crop_size()))

@@ -24,8 +24,9 @@ import numpy as np
 from full_geometry.geometry.light_points import lattice, uniform_entries
 from full_geometry.geometry.points import cosine_above, place
 from full_geometry.geometry.rounding import ray_from
-from full_geometry.geometry.snapshot import Snapshot, same_objects
-from full_geometry.integrators.gathering import Gathered, light_state
+from full_geometry.geometry.snapshot import same_objects
+from full_geometry.integrators.gathering import Gathered
+from full_geometry.integrators.inner_light import cut_to_next
 from full_geometry.integrators.surface_paths import exit_at, trace_paths
 from full_geometry.integrators.walk_paths import PathTracer
 from full_geometry.precomputed.surface_regression import ResidualSums, levels, smooth_field
@@ -89,7 +90,7 @@ class SurfaceCorrection:
         values = self.values / scale_of(self.gathered)[:, None]
         known = np.array(self.gathered.values).reshape(*values.shape[:2], self.gathered.terms)
         values[:, :, : self.gathered.terms] += known
-        return replace(self.gathered, values=mi.Float(values.astype(np.float32).ravel()), terms=values.shape[2])
+        return replace(self.gathered, values=mi.Float(values.astype(np.float32).ravel()))
 
     @property
     def told(self) -> str:
@@ -110,7 +111,6 @@ class Corrections:
 
     def __init__(self, part: int = 0) -> None:
         self._part = part
-        self._state: Snapshot | None = None
         self._gathered: list[Gathered] = []
         self._known: list[SurfaceCorrection | None] = []
         self._found: list[TranslucentObject] = []
@@ -130,12 +130,12 @@ class Corrections:
         Raises:
             ValueError: the light of an object cannot be corrected.
         """
-        # ---- what is known still holds, unless light or objects have changed
-        started, gathered, state = clock(), [obj.gathered for obj in objects], light_state(scene)
+        # ---- what is known still holds for the same gathered light, which changes with light and objects
+        started, gathered = clock(), [obj.gathered for obj in objects]
         for obj in objects:
             _check(obj)
-        if state != self._state or not same_objects(gathered, self._gathered):
-            self._state, self._gathered, self._known = state, gathered, [None] * len(objects)
+        if not same_objects(gathered, self._gathered):
+            self._gathered, self._known = gathered, [None] * len(objects)
 
         # ---- walks that are missing, in two halves
         number = int(np.clip(samples // SAMPLES_PER_WALK, FEWEST, MOST))
@@ -229,10 +229,8 @@ def _steadied(r: np.ndarray, a: np.ndarray) -> np.ndarray:
 
     Of a lamp that walks meet by chance one residual in thousands may hold more than all others beside it.
     """
-    # cut to the size of the next; the sum stays, Σ a_s times the mean of what is lost
-    size = np.abs(r).max(axis=1)
-    most = np.quantile(size, 1 - BRIGHTEST)
-    kept = r * np.minimum(1, most / np.maximum(size, 1e-30))[:, None]
+    # the sum stays: Σ a_s times the mean of what is lost
+    kept = cut_to_next(r, BRIGHTEST)
     return kept + a * ((r - kept).sum(axis=0) / a.sum(axis=0))
 
 

@@ -72,7 +72,6 @@ class Gathered:
         light: that arrives, less c.
         parts: independent estimates of it.
         c: mean radiance of the environment where alpha is known, else 0, see `lighting.EnvironmentMean`.
-        terms: how many for each channel.
     """
 
     object: TranslucentObject
@@ -84,7 +83,11 @@ class Gathered:
     light: Incident
     parts: tuple[Incident, ...] = ()
     c: np.ndarray | float = 0.0
-    terms: int = 4
+
+    @property
+    def terms(self) -> int:
+        """Terms of `directional` for each channel of a point."""
+        return dr.width(self.values) // (len(self.points) * dr.size_v(mi.Spectrum))
 
     def radiance(self, out: SurfacePoint, active: mi.Bool) -> mi.Spectrum:
         """L_o of an exit; 0 below the horizon."""

@@ -142,11 +142,15 @@ def _beyond(
 
 def _steadied(sums: np.ndarray) -> np.ndarray:
     """Sums without the brightest events, whose light goes to those beside them by what they have."""
-    # cut to the size of the next brightest; what a group of neighbours loses goes to it by what it has left
-    size = np.abs(sums).max(axis=(1, 2))
-    most = np.quantile(size, 1 - BRIGHTEST)
-    if not most > 0:
-        return sums
-    kept = (sums * np.minimum(1, most / np.maximum(size, 1e-30))[:, None, None]).reshape(SHARING, -1, *sums.shape[1:])
+    # what a group of neighbours loses goes to it by what it has left
+    kept = cut_to_next(sums, BRIGHTEST).reshape(SHARING, -1, *sums.shape[1:])
     whole = sums[:, 0].reshape(*kept.shape[:2], -1).sum(axis=1) / np.maximum(kept[:, :, 0].sum(axis=1), 1e-30)
     return (kept * whole[:, None, None]).reshape(sums.shape)
+
+
+def cut_to_next(values: np.ndarray, brightest: float) -> np.ndarray:
+    """Values (n, ...) of which a share, the brightest, has the size of the next one; as they are where that is 0."""
+    # size: the largest |number| of each of the n
+    size = np.abs(values).max(axis=tuple(range(1, values.ndim)), keepdims=True)
+    most = np.quantile(size, 1 - brightest)
+    return values * np.minimum(1, most / np.maximum(size, 1e-30)) if most > 0 else values

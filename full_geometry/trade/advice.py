@@ -18,9 +18,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from full_geometry.scenes.scene_files import PATH_TRACED
+from full_geometry.settings import GATHERED_LIGHTS
 from full_geometry.trade.assessing import assess
 from full_geometry.trade.results import UNNAMED, Assessment, ObjectTrade, TechniqueTrade, html_table, samples_for
-from full_geometry.trade.techniques import CORRECTED, GATHERED, LAMBERT, PRECOMPUTED_WALKS, Job, Technique
+from full_geometry.trade.techniques import CORRECTED, LAMBERT, PRECOMPUTED_WALKS, Job, Technique
 from halfspace_sss.noise_free import short
 
 if TYPE_CHECKING:
@@ -130,7 +131,7 @@ def advise(assessment: Assessment, job: Job) -> Advice:
     told = [o for o in objects if o.way is not None]
     kinds = (
         INTEGRATOR,
-        *(f"{INTEGRATOR}, {light}" for light in (GATHERED, CORRECTED)),
+        *(f"{INTEGRATOR}, {light}" for light in GATHERED_LIGHTS),
         PATH_TRACED,
         PRECOMPUTED_WALKS.name,
     )

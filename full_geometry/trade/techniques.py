@@ -19,12 +19,12 @@ from full_geometry.objects.objects import KnowsUnit, millimetres, refuse_instanc
 from full_geometry.objects.small_emitters import is_delta
 from full_geometry.scenes.reference import check_sensor
 from full_geometry.scenes.scene_files import PATH_TRACED, load_objects
-from full_geometry.settings import AUTO, check_variant
+from full_geometry.settings import AUTO, GATHERED_LIGHTS, check_variant
 from full_geometry.transport.models import model_names
 from halfspace_sss.checks import check_choice, check_count, check_interval
 
 LAMBERT, READY_FIRST = "lambert", "better_dipole"
-GATHERED, CORRECTED, PRECOMPUTED = "gathered", "corrected", "precomputed"
+GATHERED, CORRECTED, PRECOMPUTED = *GATHERED_LIGHTS, "precomputed"
 RAYS = 2**19  # of light precomputed for walks, for each object: its noise at a point is 3 to 8 %
 
 
@@ -59,7 +59,7 @@ class Technique:
     @property
     def gathers(self) -> bool:
         """Whether light is gathered before the first sample."""
-        return self.light in (GATHERED, CORRECTED)
+        return self.light in GATHERED_LIGHTS
 
     @property
     def halves(self) -> tuple[Technique, ...]:
@@ -80,7 +80,7 @@ class Technique:
         """The technique of that name; ValueError if there is none."""
         model, _, light = name.partition(", ")
         check_choice("way", model, (PATH_TRACED, *(m for m in model_names() if m != AUTO)))
-        known = {PATH_TRACED: (PRECOMPUTED,), LAMBERT: ()}.get(model, (GATHERED, CORRECTED))
+        known = {PATH_TRACED: (PRECOMPUTED,), LAMBERT: ()}.get(model, GATHERED_LIGHTS)
         if light:
             check_choice(f"light of {model}", light, known)
         return cls(model, light or "sampled")

@@ -37,7 +37,7 @@ from full_geometry.objects.objects import (
     translucent_shapes,
     with_inclusions,
 )
-from full_geometry.settings import AUTO, AUTOMATIC, GATHERED, Capabilities, Choices, Settings
+from full_geometry.settings import AUTO, AUTOMATIC, GATHERED_LIGHTS, Capabilities, Choices, Settings
 from full_geometry.surface.medium_derivatives import DifferentiableTransport, MediumDerivatives
 from full_geometry.surface.translucent import MediumSpec, check_boundary
 from full_geometry.surface.varying import equivalent, warn_of_means
@@ -54,7 +54,7 @@ def _check_repeated(geometry: Geometry, spec: MediumSpec, settings: Settings) ->
     """ValueError if instances of an object are not what its model or light takes."""
     if spec.varying is not None:
         raise ValueError(f"the medium of an instance must not vary in space, got object {geometry.name}")
-    if settings.light in GATHERED:
+    if settings.light in GATHERED_LIGHTS:
         raise ValueError(
             f"light must be sampled of objects that instances show, got {settings.light} of {geometry.name}"
         )
