@@ -1,4 +1,4 @@
-"""What packages add to the library and to the command line, found by entry points so that no import goes back.
+"""What packages of others add to the library and to the command line, found by entry points.
 
 - `halfspace_sss.models`: list of model classes.
 - `halfspace_sss.materials`: path of a material file or folder, or an iterable of `Material`.
@@ -18,7 +18,6 @@ from importlib.metadata import EntryPoint, entry_points
 COMMANDS, MODELS = "halfspace_sss.commands", "halfspace_sss.models"
 LEARNERS, TRANSPORTS = "halfspace_sss.learners", "halfspace_sss.transports"
 FAILURES = (Exception, SystemExit)  # what code of somebody else may end with
-OWN = "halfspace-sss"  # the distribution of this project
 
 
 def warn_left_out(group: str, name: str, error: object) -> None:
@@ -32,13 +31,8 @@ def offers(group: str) -> dict[str, EntryPoint]:
     """The entry points by which packages of others join a group, the first of each name; none is loaded."""
     results: dict[str, EntryPoint] = {}
     for entry in entry_points(group=group):
-        if not _is_own(entry):
-            results.setdefault(entry.name, entry)
+        results.setdefault(entry.name, entry)
     return results
-
-
-def _is_own(entry: EntryPoint) -> bool:
-    return entry.dist is not None and entry.dist.name == OWN
 
 
 def loaded(entry: EntryPoint) -> object:
@@ -50,10 +44,10 @@ def loaded(entry: EntryPoint) -> object:
         return None
 
 
-def offered(group: str, own: bool = False) -> Iterator[tuple[str, object]]:
-    """Name and object of every entry point of a group that loads, of packages of others or of this project."""
+def offered(group: str) -> Iterator[tuple[str, object]]:
+    """Name and object of every entry point of a group that loads."""
     for entry in entry_points(group=group):
-        if _is_own(entry) == own and (result := loaded(entry)) is not None:
+        if (result := loaded(entry)) is not None:
             yield entry.name, result
 
 

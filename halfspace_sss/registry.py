@@ -1,14 +1,14 @@
 """Half-space models by name.
 
-Those of `halfspace_sss.neural` are listed there. All others join by entry points of the group `halfspace_sss.models`,
-each a list of classes, `analytic_models` too: it stands above this package, which cannot import it. A list is taken as
-a whole, or left out with a warning.
+Those of `analytic_models` and `halfspace_sss.neural` are listed there. Models of other packages join by entry points of
+the group `halfspace_sss.models`, each a list of classes: it is taken as a whole, or left out with a warning.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
+from analytic_models import MODELS as ANALYTIC
 from halfspace_sss.checks import did_you_mean
 from halfspace_sss.extensions import FAILURES, MODELS, offered, warn_left_out
 from halfspace_sss.interface.model import BSSRDF
@@ -22,7 +22,7 @@ _registered: dict[str, type[BSSRDF]] = {}
 
 @once
 def _installed() -> Mapping[str, type[BSSRDF]]:
-    """Models of `neural`, and of all installed packages."""
+    """Models of this project, then those of all installed packages."""
     return listed_models(BSSRDF)
 
 
@@ -85,8 +85,8 @@ def check_model_class(cls: object, base: type) -> None:
 
 def listed_models(base: type) -> dict[str, type]:
     """The model classes of all lists by name: of `analytic_models`, of `neural`, of other packages."""
-    results: dict[str, type] = {}
-    for name, classes in (*offered(MODELS, own=True), ("neural", NEURAL), *offered(MODELS)):
+    results: dict[str, type] = _new_models([*ANALYTIC, *NEURAL], base, {})
+    for name, classes in offered(MODELS):
         try:
             results |= _new_models(classes, base, results)
         except FAILURES as error:

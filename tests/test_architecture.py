@@ -17,13 +17,14 @@ else:
     import tomli as tomllib
 
 ROOT = Path(__file__).resolve().parent.parent
-ORDER = ["benchmarks", "figures", "full_geometry", "analytic_models", "halfspace_sss"]  # imports go to the right
-SOURCES = sorted(path for package in ORDER for path in (ROOT / package).rglob("*.py"))
+ORDER = ["benchmarks", "figures", "full_geometry", "halfspace_sss"]  # imports go to the right
+BESIDE = "analytic_models"  # a room of the plane with a folder of its own
+SOURCES = sorted(path for package in (*ORDER, BESIDE) for path in (ROOT / package).rglob("*.py"))
 HEAVY = ["torch", "mitsuba", "matplotlib", "drjit", "pandas", "xarray"]
 FLOORS = {  # of each package, a room or file may import those to its left; "" is all other files
     "halfspace_sss": [
-        "", "physics", "interface", "neural", "registry", "tracing", "maps", "measure", "materials", "comparison",
-        "neural.training", "cli",
+        "", "physics", "interface", "neural", BESIDE, "registry", "tracing", "maps", "measure", "materials",
+        "comparison", "neural.training", "cli",
     ],
     "full_geometry": [
         "", "geometry", "surface", "objects", "walk", "transport", "precomputed", "integrators", "scenes",
@@ -31,7 +32,6 @@ FLOORS = {  # of each package, a room or file may import those to its left; "" i
     ],
     "figures": ["parts", "modelling", "computing", "drawing", ""],
 }  # fmt: skip
-ENTRY_POINTS = {"halfspace_sss.models"}  # by which packages above join the plane
 HIDING = {"bssrdf", "curves", "models", "trace"}  # public functions: a folder of that name would hide one
 LONGEST_BODY = 60
 ADDRESS = re.compile(r"[a-z_]\w*(?:\.\w+)+(?::\w+)?")  # "package.module" or "package.module:name"
@@ -66,8 +66,14 @@ MODULES = {_name(path): path for path in SOURCES}
 def _room(module: str) -> str:
     """The folder of a module below its package, or its name if it is a floor itself; a package within is in itself."""
     package, _, name = module.partition(".")
+    if package == BESIDE:
+        return BESIDE
     folder = MODULES[module].parent.relative_to(ROOT).parts
     return name if name in FLOORS.get(package, ()) else ".".join(folder[1:])
+
+
+def _package(module: str) -> str:
+    return module.partition(".")[0].replace(BESIDE, "halfspace_sss")
 
 
 def _module(name: str) -> str | None:
@@ -133,7 +139,7 @@ def test_a_package_imports_only_packages_below_it(package: str) -> None:
     above = set(ORDER[: ORDER.index(package)])
     back = {
         str(path.relative_to(ROOT)): bad
-        for path in (ROOT / package).rglob("*.py")
+        for path in (MODULES[module] for module in MODULES if _package(module) == package)
         if (bad := _imported_packages(path) & above)
     }
     assert not back
@@ -147,7 +153,7 @@ def test_a_room_imports_only_rooms_below_it(package: str) -> None:
         for module, targets in _all_arrows().items()
         for target in targets - set(FLOORS)
         if not module.endswith(".__main__")  # the command line's other name
-        and module.partition(".")[0] == target.partition(".")[0] == package
+        and _package(module) == _package(target) == package
         and floors.index(_room(target)) > floors.index(_room(module))
     }
     assert not up
@@ -158,9 +164,9 @@ def test_a_module_that_is_named_in_a_text_counts_as_imported() -> None:
     assert "full_geometry.trade.automatic" in _all_arrows()["full_geometry.plugins"]
 
 
-def test_the_entry_points_of_the_project_are_those_that_the_plane_cannot_name() -> None:
-    points = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["entry-points"]
-    assert set(points) == ENTRY_POINTS
+def test_the_project_has_no_entry_points_but_its_command() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert "entry-points" not in project and set(project["scripts"]) == {"halfspace-sss"}
 
 
 def test_no_modules_import_each_other_in_a_circle() -> None:
@@ -175,7 +181,7 @@ def test_a_circle_is_found() -> None:
 
 def test_every_room_has_its_floor() -> None:
     for package, floors in FLOORS.items():
-        rooms = {_room(module) for module in MODULES if module.partition(".")[0] == package}
+        rooms = {_room(module) for module in MODULES if _package(module) == package}
         assert rooms == set(floors)
 
 
@@ -185,7 +191,7 @@ def test_no_folder_hides_a_public_function() -> None:
 
 def test_every_top_level_package_is_in_the_order() -> None:
     packages = {path.parent.name for path in ROOT.glob("*/__init__.py")}
-    assert packages - {"tests"} == set(ORDER)
+    assert packages - {"tests"} == {*ORDER, BESIDE}
 
 
 def test_importing_the_package_loads_nothing_heavy() -> None:

@@ -72,7 +72,7 @@ def _model(**members: Any) -> type:
     ],
 )
 def test_models_that_are_none_are_left_out(offer: Any, wrong: Any, why: str) -> None:
-    offer(Entry("broken", wrong), Entry("analytic", MODELS, "analytic_models:MODELS"))
+    offer(Entry("broken", wrong))
     with pytest.warns(UserWarning) as found:
         models = registry._installed.__wrapped__()
     assert list(models) == OWN
@@ -80,7 +80,7 @@ def test_models_that_are_none_are_left_out(offer: Any, wrong: Any, why: str) -> 
 
 
 def test_models_of_other_packages_join_behind(offer: Any) -> None:
-    offer(Entry("more", [_model()]), Entry("analytic", MODELS, "analytic_models:MODELS"))
+    offer(Entry("more", [_model()]))
     assert list(registry._installed.__wrapped__()) == [*OWN, "other"]
 
 
