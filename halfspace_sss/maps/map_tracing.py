@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import ModuleType
 
 import numpy as np
@@ -18,7 +18,7 @@ from halfspace_sss.physics.fresnel import F_t, mu_internal
 from halfspace_sss.physics.medium import Medium, eval_hg
 from halfspace_sss.tracing.passes import PATHS_PER_LANE
 from halfspace_sss.tracing.tallies import CellSums
-from halfspace_sss.tracing.walk import Scatter, Tally, pass_seed, walk
+from halfspace_sss.tracing.walk import Scatter, Tally, at_lanes, pass_seed, walk
 
 GROUP = 16  # observations that share a walk
 HITS = 2  # scores per event, one in each half of the summed contributions
@@ -68,7 +68,8 @@ class MapTally(Tally):
     Args:
         types: Dr.Jit's array types.
         n_r, n_psi: cells of a map.
-        phase: phase function towards an observation, of its cosine and the event.
+        phase: phase function towards an observation, of its cosine, the event and g.
+        g: of the medium, as lanes or a constant.
         directions: of each observation d_x, d_y, mu, 1/mu and 1/(eta² mu), as lanes or constants.
         inverse_scale, low, rate: of the cells (inverse_scale is 1/L), uniform in u: row = (u(r/L) - low) rate.
         cells: the sums.
@@ -77,12 +78,17 @@ class MapTally(Tally):
     types: ModuleType
     n_r: int
     n_psi: int
-    phase: Callable[[Lanes, Scatter], Lanes]
+    phase: Callable[[Lanes, Scatter, Lanes], Lanes]
+    g: Lanes
     directions: list[tuple]
     inverse_scale: Lanes
     low: Lanes
     rate: Lanes
     cells: CellSums
+
+    def at(self, lanes: Lanes) -> MapTally:
+        names = ("g", "directions", "inverse_scale", "low", "rate")
+        return replace(self, **{name: at_lanes(getattr(self, name), lanes) for name in names})
 
     def scatter(self, sums: tuple, event: Scatter) -> tuple:
         import drjit as dr
@@ -91,7 +97,7 @@ class MapTally(Tally):
         q = []
         for ox, oy, mu, inverse_mu, scale in self.directions:
             cosine = event.dx * ox + event.dy * oy - event.dz * mu
-            q.append(scale * self.phase(cosine, event) * dr.exp(-event.z * inverse_mu))
+            q.append(scale * self.phase(cosine, event, self.g) * dr.exp(-event.z * inverse_mu))
         total = sum(q[1:], q[0])
         for hit in range(HITS):
             # draw one of them by q_k / sum q, and score the sum in the cell where it leaves
@@ -144,7 +150,11 @@ def _unit_tally(types: ModuleType, unit: MapUnit, mu_o: np.ndarray, delta_phi: n
     low, high = warp(library(0.0), cell_edges(m, grid)[0][[0, -1]] / L)
     cells = CellSums(types, GROUP * grid.n_r * grid.n_psi, MAP_BATCHES)
     scale = [dr.opaque(types.Float, v) for v in (1 / L, low, grid.n_r / (high - low))]
-    return MapTally(types, grid.n_r, grid.n_psi, lambda cosine, event: eval_hg(cosine, g), directions, *scale, cells)
+
+    def phase(cosine: Lanes, _: Scatter, g: Lanes) -> Lanes:
+        return eval_hg(cosine, g)
+
+    return MapTally(types, grid.n_r, grid.n_psi, phase, g, directions, *scale, cells)
 
 
 def _trace_group(unit: MapUnit, group: int, launch: int, lanes: int, per_lane: int) -> tuple[np.ndarray, int]:

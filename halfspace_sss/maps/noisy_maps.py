@@ -148,7 +148,7 @@ def _group_tally(types: ModuleType, groups: Groups, grid: CellGrid, lanes_per_gr
     def lanes(values: np.ndarray) -> Lanes:
         return types.Float(np.repeat(values, lanes_per_group).astype(np.float32))
 
-    def phase(cosine: Lanes, event: Scatter) -> Lanes:
+    def phase(cosine: Lanes, event: Scatter, g: Lanes) -> Lanes:
         last, first = eval_hg(cosine, g), eval_hg(event.first, g)
         return 2 * last * first / (first + last)
 
@@ -161,7 +161,7 @@ def _group_tally(types: ModuleType, groups: Groups, grid: CellGrid, lanes_per_gr
     scale = (lanes(1 / groups.L), lanes(edges[:, 0]), lanes(grid.n_u / (edges[:, -1] - edges[:, 0])))
     cells = _GroupCells(types, GROUP * grid.n_u * grid.n_psi, len(groups), lanes_per_group)
     dr.eval(g, directions, *scale)
-    return MapTally(types, grid.n_u, grid.n_psi, phase, directions, *scale, cells)
+    return MapTally(types, grid.n_u, grid.n_psi, phase, g, directions, *scale, cells)
 
 
 def _launch(

@@ -210,9 +210,9 @@ def _walk(types, layers: Layers, mu_in, paths_per_lane: int, seed, tallies, *, d
     mu_in = dr.clip(mu_in, 1e-6, 1.0)
     sin_in = dr.sqrt(dr.maximum((1 - mu_in) * (1 + mu_in), 0.0))
     begin = 1 - F_r(mu_in, dr.gather(Float, m.eta_up, dr.zeros(UInt32, lanes))) if diffuse else Float(1)
-    dr.eval(mu_in, sin_in, begin)
-    last = dr.opaque(UInt32, paths_per_lane)
     lane = dr.arange(UInt32, lanes)
+    dr.eval(mu_in, sin_in, begin, lane)
+    last = dr.opaque(UInt32, paths_per_lane)
     zero, count = dr.zeros(Float, lanes), dr.zeros(UInt32, lanes)
     state = {
         "rng": generator(types, lanes, seed), "layer": count, "deepest": count,
@@ -220,10 +220,11 @@ def _walk(types, layers: Layers, mu_in, paths_per_lane: int, seed, tallies, *, d
         "weight": zero + begin, "order": count, "step": count, "path": count, "events": count,
     }  # fmt: skip
 
-    def body(s: dict) -> tuple[dict]:
-        return (_step(s, m, (sin_in, mu_in, begin), lane, tally),)
+    def body(given: tuple, s: dict) -> tuple[dict]:
+        return (_step(s, m, *given, tally),)
 
-    (s,) = in_launches((state,), lambda s: s["path"] < last, body, "layers")
+    given = ((sin_in, mu_in, begin), lane)
+    (s,) = in_launches((state,), given, lambda s: s["path"] < last, body, "layers")
     return ((),), s["events"]
 
 

@@ -10,8 +10,9 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 
@@ -30,6 +31,7 @@ LONG_PATH, VERY_LONG_PATH = 4096, 2**18
 LONG_SURVIVAL, VERY_LONG_SURVIVAL = math.sqrt(0.5), 0.5
 LAUNCH_SECONDS = 0.7  # of a kernel, in which Python hears no interrupt
 FIRST_TURNS, FEWEST_TURNS = 64, 16  # of the loop in a launch
+FEW, ONE_PACKET = 0.5, 32  # share of lanes at which those that go on are put together; not below so many
 
 
 @dataclass
@@ -68,6 +70,10 @@ class Tally:
     def start(self, lanes: int) -> tuple:
         """Per-lane sums at zero; by default none."""
         return ()
+
+    def at(self, lanes: Lanes) -> Tally:
+        """The tally of some of the lanes; by default it knows nothing of lanes but by events."""
+        return self
 
     def boundary(self, sums: tuple, event: Boundary) -> tuple:
         """Sums after a meeting with the surface; by default as they were."""
@@ -117,6 +123,10 @@ class WalkConstants:
         check_ratios(albedo, g, eta)
         lanes = (types.Float(types.Float64(v)) for v in (albedo, g, 1 / eta))  # rounded by Dr.Jit: aligned memory
         return cls(*lanes, bool(np.all(g == 0)), bool(np.all(eta == 1)))
+
+    def at(self, lanes: Lanes) -> WalkConstants:
+        """Those of some of the lanes."""
+        return replace(self, **{name: at_lanes(getattr(self, name), lanes) for name in ("albedo", "g", "inverse_eta")})
 
     def check_lanes(self, lanes: int) -> None:
         """ValueError unless the constants are those of one medium or of as many lanes as are walked."""
@@ -173,35 +183,82 @@ def turn(dx: Lanes, dy: Lanes, dz: Lanes, cosine: Lanes, azimuth: Lanes) -> tupl
     return nx * shrink, ny * shrink, nz * shrink
 
 
-def in_launches(state: tuple, going: Callable[..., Lanes], body: Callable[..., tuple], label: str) -> tuple:
+def at_lanes(value: Any, lanes: Lanes) -> Any:
+    """Arrays, or trees of them, at some of the lanes, scheduled to be evaluated; numbers stay."""
+    import drjit as dr
+
+    if isinstance(value, dict):
+        return {key: at_lanes(v, lanes) for key, v in value.items()}
+    if isinstance(value, (tuple, list)):
+        return type(value)(at_lanes(v, lanes) for v in value)
+    if hasattr(value, "at"):
+        return value.at(lanes)
+    if dr.width(value) > 1:
+        value = dr.gather(type(value), value, lanes)
+        dr.schedule(value)
+    return value
+
+
+def _put_back(whole: Any, part: Any, lanes: Lanes) -> None:
+    """Write what `at_lanes` took to where it was."""
+    import drjit as dr
+
+    if isinstance(part, (tuple, dict)):
+        for key in part if isinstance(part, dict) else range(len(part)):
+            _put_back(whole[key], part[key], lanes)
+    else:
+        dr.scatter(whole, part, lanes)
+
+
+def in_launches(
+    state: tuple, given: tuple, going: Callable[..., Lanes], body: Callable[..., tuple], label: str
+) -> tuple:
     """A symbolic loop in launches of about `LAUNCH_SECONDS`; lanes go on where they were, to the last bit.
+
+    A lane that has ended waits for the last one of its packet. `LAUNCH_SECONDS` after the first launch, those that go
+    on are put together whenever half of them have ended.
 
     Args:
         state: of the loop, arrays or trees of them.
+        given: what does not change: numbers, arrays of a value per lane, or what has `at` of lanes.
         going: of the state, which lanes go on.
-        body: of the state, the next one.
+        body: of `given` and the state, the next state.
         label: of the kernel.
     """
     import drjit as dr
 
     UInt32 = dr.uint32_array_t(type(going(*state)))
 
-    def launch(state: tuple, most: Lanes) -> tuple:
+    def launch(state: tuple, given: tuple, most: Lanes) -> tuple:
         loop = (UInt32(0), *state)
         loop = dr.while_loop(
-            loop, lambda k, *s: going(*s) & (k < most), lambda k, *s: (k + 1, *body(*s)), mode="symbolic", label=label
-        )
+            loop, lambda k, *s: going(*s) & (k < most), lambda k, *s: (k + 1, *body(given, *s)), mode="symbolic",
+            label=label,
+        )  # fmt: skip
         dr.eval(loop[1:])
         return loop[1:]
 
     dr.make_opaque(state)  # as they are in later launches: one kernel
-    turns = FIRST_TURNS
+    turns, first_ended, whole, lanes = FIRST_TURNS, math.inf, None, None
     while True:
         started = time.perf_counter()
-        state = launch(state, dr.opaque(UInt32, turns))
-        if not dr.any(going(*state)):
-            return state
-        turns = int(max(turns * min(LAUNCH_SECONDS / (time.perf_counter() - started), 16), FEWEST_TURNS))
+        state = launch(state, given, dr.opaque(UInt32, turns))
+        left = going(*state)
+        width, n = dr.width(left), dr.count(left)[0]
+        ended = time.perf_counter()
+        first_ended = min(first_ended, ended)
+        long = ended - first_ended > LAUNCH_SECONDS
+        if n == 0 or (long and ONE_PACKET < width and n <= FEW * width):
+            if lanes is None:
+                whole, lanes = state, dr.arange(UInt32, width)
+            else:
+                _put_back(whole, state, lanes)
+            if n == 0:
+                return whole
+            kept = dr.compress(left)
+            state, given, lanes = at_lanes((state, given, lanes), kept)
+            dr.eval()  # what was gathered
+        turns = int(max(turns * min(LAUNCH_SECONDS / (ended - started), 16), FEWEST_TURNS))
 
 
 def walk(
@@ -242,9 +299,9 @@ def walk(
     constants.check_lanes(lanes)
     mu_in = dr.clip(mu_in, 1e-6, 1.0)
     sin_in = dr.sqrt(dr.maximum((1 - mu_in) * (1 + mu_in), 0.0))
-    dr.eval(mu_in, sin_in, constants.albedo, constants.g, constants.inverse_eta)
-    last = dr.opaque(UInt32, paths_per_lane)
     lane = dr.arange(UInt32, lanes)
+    dr.eval(mu_in, sin_in, lane, constants.albedo, constants.g, constants.inverse_eta)
+    last = dr.opaque(UInt32, paths_per_lane)
     zero = dr.zeros(Float, lanes)
     count = dr.zeros(UInt32, lanes)
     begin = dr.opaque(Float, weight) if isinstance(weight, float) else weight
@@ -254,11 +311,11 @@ def walk(
         "weight": zero + begin, "first": zero + 1, "order": count, "path": count, "events": count,
     }  # fmt: skip
 
-    def body(s: dict, sums: tuple) -> tuple[dict, tuple]:
-        return _step(s, sums, constants, (sin_in, mu_in, begin), lane, tallies)
-
-    start = tuple(t.start(lanes) for t in tallies)
-    s, sums = in_launches((state, start), lambda s, sums: s["path"] < last, body, "walk")
+    given = (constants, (sin_in, mu_in, begin), lane, tuple(tallies))
+    sums = tuple(t.start(lanes) for t in tallies)
+    s, sums = in_launches(
+        (state, sums), given, lambda s, sums: s["path"] < last, lambda given, *state: _step(*state, *given), "walk"
+    )
     return sums, s["events"]
 
 

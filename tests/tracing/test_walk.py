@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from halfspace_sss import Medium, trace
+from halfspace_sss import Layers, Medium, trace
 from halfspace_sss.backend import array_types
+from halfspace_sss.maps.noisy_maps import CellGrid, draw_directions, trace_groups
 from halfspace_sss.physics.fresnel import F_t, mu_internal
 from halfspace_sss.tracing.tallies import FluxTally
 from halfspace_sss.tracing.walk import WalkConstants, generator, pass_seed, walk
@@ -65,6 +66,40 @@ def test_another_medium_or_seed_compiles_no_other_kernel():
 
     compiled(Medium(0.9, 0.1, 0.5, 1.3), 0)
     assert compiled(Medium(0.7, 0.2, -0.3, 1.5), 1) == compiled(Medium(2.0, 0.1, 0.9, 0.8), 2) == 0
+
+
+def _maps() -> list[np.ndarray]:
+    rng = np.random.default_rng(3)
+    groups = draw_directions(np.array([0.9, 0.99]), np.array([0.2, 0.8]), np.array([1.0, 1.4]), rng)
+    (launch,) = trace_groups(groups, CellGrid(8, 4), 1e6, (1,))
+    return [launch.trace()]
+
+
+def _reflected() -> list[np.ndarray]:
+    run = trace(Medium.from_albedo(0.999, 1.0, 0.5, 1.4), 0.7, 4096, 1, radii=[0.0, 1.0, 9.0])
+    return [*run.reflectance(), *run.exitance()]
+
+
+def _reflected_by_layers() -> list[np.ndarray]:
+    return [*trace(Layers([Medium(1.0, 0.0, 0.5, 1.4), Medium(1.0, 0.01)], [2.0]), 0.7, 4096, 1).reflectance()]
+
+
+@pytest.mark.parametrize("traced", [_maps, _reflected, _reflected_by_layers])
+def test_lanes_that_go_on_are_put_together_and_give_the_same_bits(monkeypatch, traced):
+    import drjit as dr
+
+    def widths() -> set[int]:
+        return {k["size"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT and k["size"] > 1}
+
+    runs = []
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        for seconds in (1e9, 0.0):
+            monkeypatch.setattr("halfspace_sss.tracing.walk.LAUNCH_SECONDS", seconds)
+            dr.kernel_history_clear()
+            runs.append((traced(), widths()))
+    (apart, wide), (together, narrow) = runs
+    assert all(np.array_equal(a, b) for a, b in zip(apart, together))
+    assert min(narrow - wide) < 64
 
 
 def test_lanes_are_independent():
