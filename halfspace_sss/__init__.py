@@ -34,14 +34,18 @@ if TYPE_CHECKING:
     from halfspace_sss.physics.layers import Layers
     from halfspace_sss.physics.medium import Medium
     from halfspace_sss.registry import bssrdf, models, register_model
+    from halfspace_sss.tracing.instrument import Fibre, Instrument, Ring
     from halfspace_sss.tracing.tracer import trace
 
 prefer_bundled_llvm()
 
 __all__ = [
     "BSSRDF",
+    "Fibre",
+    "Instrument",
     "Layers",
     "Medium",
+    "Ring",
     "bssrdf",
     "curves",
     "make_maps",
@@ -57,8 +61,11 @@ __getattr__, __dir__ = lazy_names(
     __name__,
     {
         "BSSRDF": "interface.model",
+        "Fibre": "tracing.instrument",
+        "Instrument": "tracing.instrument",
         "Layers": "physics.layers",
         "Medium": "physics.medium",
+        "Ring": "tracing.instrument",
         "bssrdf": "registry",
         "curves": "comparison.reflectance_curves",
         "make_maps": "maps.map_store",

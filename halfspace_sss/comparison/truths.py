@@ -17,6 +17,7 @@ from halfspace_sss.checks import check_cosine, check_count
 from halfspace_sss.physics.fresnel import F_r
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import Progress
+from halfspace_sss.tracing.instrument import Instrument
 from halfspace_sss.tracing.passes import Estimate, estimate, walk_passes
 from halfspace_sss.tracing.tracer import Trace, trace
 from halfspace_sss.tracing.walk import Boundary, Tally
@@ -28,6 +29,8 @@ MEASURES = {
     "BRDF [1/sr]": "BRDF",
     "H(mu)": "H",
     "R_d(r) ring mean [1/cm^2]": "ring",
+    "R_d(r,t) [1/(mm^2 ns)]": "ring in time",
+    "R_d(f,t) [1/ns]": "frequency in time",
     "<r^2> [1/sigma_t^2]": "r2",
     "<x> [1/sigma_t]": "x",
     "<path length> [1/sigma_t]": "length",
@@ -38,8 +41,10 @@ MEASURES = {
 }
 FACTOR_ALBEDO = 0.5  # traced where the row gives a factor of albedo^n, which holds for every albedo
 PER_CM2 = 100.0  # 1/mm² in 1/cm²
+PER_NS = 1000.0  # 1/ps in 1/ns
 _COEFFICIENTS = re.compile(r"mua=([\d.]+) mus=([\d.]+) 1/cm")
 _RING = re.compile(r"\[([\d.]+),([\d.]+)\] cm")
+_IN_TIME = re.compile(r"(?:\[([\d.]+),([\d.]+)\] mm|([\d.]+) /mm) \[([\d.]+),([\d.]+)\] ns")
 
 
 @dataclass(frozen=True)
@@ -53,6 +58,8 @@ class Truth:
         mu_i: external cosine of incidence, or "diffuse".
         direction: (mu_o, delta_phi) of a BRDF, delta_phi = 0 forward.
         ring: inner and outer radius, mm.
+        frequency: spatial, 1/mm.
+        times: beginning and end, ps.
         factor: multiplies the traced value to give the row's quantity.
         value, uncertainty: the truth and one standard deviation (or bound) of it.
     """
@@ -69,6 +76,13 @@ class Truth:
     factor: float
     value: float
     uncertainty: float
+    frequency: float | None = None
+    times: tuple[float, float] | None = None
+
+    @property
+    def alone(self) -> str | None:
+        """What needs a run of its own beside the other rows of the same medium and incidence."""
+        return self.measure if self.measure == "double" or self.times else None
 
 
 @dataclass(frozen=True)
@@ -124,7 +138,7 @@ def _truth(row: dict[str, str]) -> Truth:
     measure = MEASURES[row["quantity"]]
     mu_i = "diffuse" if row["mu_i"] == "diffuse" else _number(row, "mu_i")
     medium, factor = _medium(row)
-    direction = ring = None
+    direction = ring = frequency = times = None
     if measure == "BRDF":
         phi = 0.0 if row["phi_deg"] == "any" else math.radians(_number(row, "phi_deg"))
         direction = (_number(row, "mu_o"), phi)
@@ -135,9 +149,17 @@ def _truth(row: dict[str, str]) -> Truth:
         if match is None:
             raise ValueError(f"other must hold a ring [a,b] cm, got {row['other']!r}")
         ring, factor = tuple(round(10 * float(v), 9) for v in match.groups()), PER_CM2
+    elif measure.endswith("in time"):
+        match = _IN_TIME.fullmatch(row["other"])
+        if match is None or (match[3] is None) == measure.startswith("frequency"):
+            raise ValueError(f"other must hold '[a,b] mm [c,d] ns' or 'f /mm [c,d] ns', got {row['other']!r}")
+        numbers = [float(v) for v in match.groups() if v is not None]
+        ring, frequency = (None, numbers[0]) if match[3] else (tuple(numbers[:2]), None)
+        times, factor = tuple(round(1000 * v, 9) for v in numbers[-2:]), PER_NS
     return Truth(
         **{name: row[name] for name in ("id", "kind", "quantity", "source")}, measure=measure, medium=medium, mu_i=mu_i,
         direction=direction, ring=ring, factor=factor, value=_number(row, "value"), uncertainty=_uncertainty(row),
+        frequency=frequency, times=times,
     )  # fmt: skip
 
 
@@ -174,7 +196,8 @@ def _uncertainty(row: dict[str, str]) -> float:
 
 
 Z_LIMIT = 4.0
-PILOT, MOST_PATHS, RING_PATHS = 65536, 1_500_000_000, 64_000_000
+PILOT, MOST_PATHS, RING_PATHS, TIME_PATHS = 65536, 1_500_000_000, 64_000_000, 131_072
+FREQUENCY_RADII = np.linspace(0.0, 120.0, 1201)  # mm
 REFLECTANCE_ERROR, DIM_ERROR, OTHER_ERROR = 1e-3, 3e-3, 2e-3  # relative: albedo >= 0.5, below it, other quantities
 LEAST_CERTAIN = 0.2  # relative: beyond it a standard error rests on too few walks to be trusted
 SHARE = 0.3  # of the row's own uncertainty: a smaller error would not sharpen the test
@@ -281,7 +304,8 @@ def validate(
 
     Rows of the same medium and incidence share one run. Walks are added until the standard error is 0.1 % of a
     reflectance for albedo >= 0.5; 0.3 % of it below, and 0.2 % of other quantities, or 0.3 times the row's own
-    uncertainty if that is more. Rings take what 64 million walks give. `quick` asks for errors ten times as large.
+    uncertainty if that is more. Rings take what 64 million walks give, light in time what 131 thousand do. `quick`
+    asks for errors ten times as large.
 
     Args:
         rows: which rows to take, all if None.
@@ -310,10 +334,10 @@ def validate(
 
 
 def _groups(truths: Iterable[Truth]) -> list[list[Truth]]:
-    """Rows that one run answers: the same medium and incidence, order 2 apart."""
+    """Rows that one run answers: the same medium and incidence, order 2 and light in time apart."""
     groups: dict[tuple, list[Truth]] = {}
     for truth in truths:
-        groups.setdefault((truth.medium, truth.mu_i, truth.measure == "double"), []).append(truth)
+        groups.setdefault((truth.medium, truth.mu_i, truth.alone), []).append(truth)
     return list(groups.values())
 
 
@@ -325,7 +349,9 @@ def _group_seed(seed: int, first: Truth) -> int:
 def _compare(group: Sequence[Truth], seed: int, loosen: float) -> list[Comparison]:
     """Trace a group until its errors are small enough, each attempt with walks of its own."""
     n = int(PILOT / min(loosen, 4.0))
-    if any(t.ring for t in group):
+    if group[0].times:
+        n = int(TIME_PATHS / loosen)
+    elif any(t.ring for t in group):
         n = max(n, int(RING_PATHS / loosen**2))
     for attempt in range(6):
         results = _run(group, n, seed + attempt)
@@ -343,12 +369,29 @@ def _run(group: Sequence[Truth], n_paths: int, seed: int) -> list[Comparison]:
         return [Comparison(t, t.factor * value, t.factor * error, n, events, seed) for t in group]
     directions = list(dict.fromkeys(t.direction for t in group if t.direction))
     edges = sorted({r for t in group if t.ring for r in t.ring})
+    if group[0].times:
+        return _run_in_time(group, edges or FREQUENCY_RADII, n_paths, seed)
     padded = directions + directions[:1] * (_padded(len(directions)) - len(directions))
     result = trace(medium, mu_i, n_paths, seed, directions=padded or None, radii=edges or None)
     comparisons = []
     for truth in group:
         value, error = _answer(truth, result, directions, edges)
         comparisons.append(Comparison(truth, float(value), float(error), result.n_paths, result.n_events, seed))
+    return comparisons
+
+
+def _run_in_time(group: Sequence[Truth], radii: Sequence[float], n_paths: int, seed: int) -> list[Comparison]:
+    times = sorted({t for truth in group for t in truth.times})
+    result = trace(group[0].medium, group[0].mu_i, n_paths, seed, radii=radii, instrument=Instrument(times=times))
+    comparisons = []
+    for t in group:
+        at = times.index(t.times[0])
+        if t.ring:
+            values, errors = (v[radii.index(t.ring[0])] for v in result.readings.exitance_in_time())
+        else:
+            values, errors = (v[0] for v in result.readings.frequency_in_time([t.frequency]))
+        value, error = (float(t.factor * v[at]) for v in (values, errors))
+        comparisons.append(Comparison(t, value, error, result.n_paths, result.n_events, seed))
     return comparisons
 
 
@@ -389,7 +432,7 @@ def _h_function(truth: Truth, result: Trace, directions: list) -> Estimate:
 def _excess(c: Comparison, loosen: float) -> float:
     """Standard error over the one that is asked for."""
     truth = c.truth
-    if truth.measure == "ring":
+    if truth.measure == "ring" or truth.times:
         return 0.0
     if truth.measure in ("R_d", "R_total"):
         bright = truth.medium.albedo >= 0.5

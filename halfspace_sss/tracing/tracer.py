@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import time
 from collections.abc import Sequence
@@ -16,10 +17,11 @@ from halfspace_sss.physics.fresnel import F_t
 from halfspace_sss.physics.layers import Layers
 from halfspace_sss.physics.medium import Medium, check_scalar_medium, medium_of
 from halfspace_sss.progress import Progress
+from halfspace_sss.tracing.instrument import Instrument, Readings, Recorder, transformed
 from halfspace_sss.tracing.layer_tracing import LayerTrace, trace_layers
 from halfspace_sss.tracing.passes import Estimate, checked_radii, estimate, order_sum, walk_passes
 from halfspace_sss.tracing.tallies import AngularTally, FluxTally, LineTally, MomentTally, RingTally
-from halfspace_sss.tracing.walk import Tally
+from halfspace_sss.tracing.walk import Tally, walk
 
 
 @dataclass(frozen=True, repr=False)
@@ -31,6 +33,7 @@ class Trace:
         n_paths: walks traced, the asked number rounded up to whole batches of lanes.
         n_events: scattering events.
         seconds: wall time, compilation included.
+        readings: of the `instrument`, if one was given.
     """
 
     medium: Medium
@@ -40,8 +43,10 @@ class Trace:
     n_paths: int
     n_events: int
     seconds: float
+    readings: Readings | None
     _lanes: np.ndarray  # (lanes, sums), T_12 included
     _rings: np.ndarray | None
+    _radii: np.ndarray | None
     _n_directions: int
     _T_o: np.ndarray | None
 
@@ -82,7 +87,7 @@ class Trace:
         """∫ S dA towards each of `directions`, 1/sr: the BRDF of the uniformly lit half-space."""
         if self._T_o is None:
             raise ValueError("directions must be given to trace() for angular_reflectance, got None")
-        pairs = self._lanes[:, 8:].reshape(len(self._lanes), self._n_directions, 2)
+        pairs = self._lanes[:, 8 : 8 + 2 * self._n_directions].reshape(len(self._lanes), self._n_directions, 2)
         return estimate(order_sum(order, pairs[..., 0], pairs[..., 1]) * self._T_o)
 
     def exitance(self, order: str = "total") -> Estimate:
@@ -90,6 +95,22 @@ class Trace:
         if self._rings is None:
             raise ValueError("radii must be given to trace() for exitance, got None")
         return estimate(order_sum(order, self._rings[:, 0], self._rings[:, 1]))
+
+    def frequency_reflectance(self, frequencies: Sequence[float]) -> Estimate:
+        """R(f) = ∫ M(r) J_0(2 pi f r) dA: what light that varies as a cosine over the plane keeps of its contrast.
+
+        Args:
+            frequencies: spatial frequencies in 1/mm, >= 0.
+
+        Raises:
+            ValueError: a frequency is out of range, or `radii` do not hold all but a thousandth of what leaves.
+        """
+        if self._rings is None:
+            raise ValueError("radii must be given to trace() for spatial frequencies, got None")
+        flux = self._rings.sum(axis=1) * np.pi * np.diff(self._radii**2)
+        beyond = max(self.reflectance().value - flux.mean(axis=0).sum(), 0.0)
+        flux = np.column_stack([flux, np.full(len(flux), beyond)])
+        return estimate(transformed(flux, self._radii, frequencies))
 
 
 @overload
@@ -108,6 +129,7 @@ def trace(
     *,
     directions: Sequence[tuple[float, float]] | None = None,
     radii: Sequence[float] | None = None,
+    instrument: Instrument | None = None,
     backend: str = "llvm",
     relative_error: float | None = None,
     progress: Progress | None = None,
@@ -127,6 +149,7 @@ def trace(
         directions: pairs (mu_o, delta_phi) for `angular_reflectance`; delta_phi = 0 is forward, the far
             side; not for diffuse light.
         radii: edges in mm of the rings for `exitance`, ascending.
+        instrument: records light in time, any absorption, fluence, fibres; of half-spaces.
         backend: "llvm" or "cuda".
         relative_error: stop early, at a pass of up to 8.4 million walks, once the standard error of the total
             reflectance has come down to this fraction of it.
@@ -136,8 +159,9 @@ def trace(
         ValueError: an argument is out of range; nothing has been traced then.
     """
     if isinstance(medium, Layers):
-        if directions is not None:
-            raise ValueError(f"directions must be left out for layers, got {directions!r}")
+        for name, value in (("directions", directions), ("instrument", instrument)):
+            if value is not None:
+                raise ValueError(f"{name} must be left out for layers, got {value!r}")
         return trace_layers(
             medium, mu_i, n_paths, seed,
             radii=radii, backend=backend, relative_error=relative_error, progress=progress,
@@ -153,24 +177,28 @@ def trace(
     edges = checked_radii(radii, mu_i)
     pairs = _checked_directions(directions, mu_i)
     types, started = array_types(backend), time.perf_counter()
+    recorder = Recorder(Instrument() if instrument is None else instrument, types, medium, mu_i, edges)
 
     def tallies() -> list[Tally]:
         angular = [] if pairs is None else [AngularTally(types, medium.g, medium.eta, *pairs.T)]
         ring = [] if edges is None else [RingTally(types, edges * medium.sigma_t)]
-        return [FluxTally(types), MomentTally(types), *angular, *ring]
+        return [FluxTally(types), MomentTally(types), *angular, *ring, *recorder.tallies()]
 
     rows, rings, events, paths = [], [], 0, 0
-    for done in walk_passes(types, medium, mu_i, n_paths, (seed,), tallies, progress):
+    beam = functools.partial(walk, spot=recorder.spot)
+    for done in walk_passes(types, medium, mu_i, n_paths, (seed,), tallies, progress, beam):
         rows.append(done.lanes())
+        recorder.add(done)
         if edges is not None:
-            rings.append(done.cells(done.tallies[-1].cells).reshape(-1, 2, len(edges) - 1))
+            rings.append(done.cells(done.tallies[2 + (pairs is not None)].cells).reshape(-1, 2, len(edges) - 1))
         events, paths = events + done.n_events, paths + done.n_paths
         if relative_error and _is_certain(rows, relative_error):
             break
     exitance = None if edges is None else np.concatenate(rings) / (np.pi * np.diff(edges**2))
     return Trace(
         medium=medium, mu_i=mu_i, seed=seed, backend=backend, n_paths=paths, n_events=events,
-        seconds=time.perf_counter() - started, _lanes=np.concatenate(rows), _rings=exitance,
+        seconds=time.perf_counter() - started, readings=None if instrument is None else recorder.readings(),
+        _lanes=np.concatenate(rows), _rings=exitance, _radii=edges,
         _n_directions=0 if pairs is None else len(pairs), _T_o=None if pairs is None else F_t(pairs[:, 0], medium.eta),
     )  # fmt: skip
 

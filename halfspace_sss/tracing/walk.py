@@ -269,6 +269,7 @@ def walk(
     seed: tuple[int, int],
     tallies: Sequence[Tally],
     weight: Lanes = 1.0,
+    spot: tuple[float, float] | None = None,
 ) -> tuple[tuple, Lanes]:
     """Trace `paths_per_lane` walks one after another in each lane and return the tallies' sums and event counts.
 
@@ -284,6 +285,7 @@ def walk(
         tallies: what to record.
         weight: of a walk at its start, a number or one per lane. Above one it keeps roulette away for longer: with
             albedo^-n all walks get to order n.
+        spot: standard deviations in x and y of where walks begin, normally distributed; None is the origin.
 
     Returns:
         The sums of each tally, one entry per lane and summed over its walks, and scattering events per lane.
@@ -305,13 +307,15 @@ def walk(
     zero = dr.zeros(Float, lanes)
     count = dr.zeros(UInt32, lanes)
     begin = dr.opaque(Float, weight) if isinstance(weight, float) else weight
+    rng, spread = generator(types, lanes, seed), tuple(dr.opaque(Float, s) for s in spot or ())
+    x, y = (zero + v for v in _entry(rng, spread))
     state = {
-        "rng": generator(types, lanes, seed),
-        "x": zero, "y": zero, "z": zero, "dx": sin_in, "dy": zero, "dz": mu_in, "length": zero,
+        "rng": rng,
+        "x": x, "y": y, "z": zero, "dx": sin_in, "dy": zero, "dz": mu_in, "length": zero,
         "weight": zero + begin, "first": zero + 1, "order": count, "path": count, "events": count,
     }  # fmt: skip
 
-    given = (constants, (sin_in, mu_in, begin), lane, tuple(tallies))
+    given = (constants, (sin_in, mu_in, begin, spread), lane, tuple(tallies))
     sums = tuple(t.start(lanes) for t in tallies)
     s, sums = in_launches(
         (state, sums), given, lambda s, sums: s["path"] < last, lambda given, *state: _step(*state, *given), "walk"
@@ -332,6 +336,17 @@ def roulette(weight: Lanes, order: Lanes) -> tuple[Lanes, Lanes]:
     survive = dr.select(low, survive, dr.select(long, long_survival, 1.0))
     weight = dr.select(low, survivor, dr.select(long, weight / long_survival, weight))
     return survive, weight
+
+
+def _entry(rng: Lanes, spread: tuple) -> tuple:
+    """Where a walk begins, by Box and Muller; the origin draws no numbers."""
+    import drjit as dr
+
+    if not spread:
+        return 0.0, 0.0
+    r = dr.sqrt(-2 * dr.log(1 - rng.next_float32()))
+    sine, cosine = dr.sincos(2 * math.pi * rng.next_float32())
+    return spread[0] * r * cosine, spread[1] * r * sine
 
 
 def _step(s: dict, sums: tuple, m: WalkConstants, start: tuple, lane: Lanes, tallies: Sequence[Tally]) -> tuple:
@@ -373,12 +388,13 @@ def _step(s: dict, sums: tuple, m: WalkConstants, start: tuple, lane: Lanes, tal
     # play Russian roulette, w <- w / P(survive); a lane whose walk ends begins the next one
     survive, weight = roulette(weight, order)
     ends = rng.next_float32() >= survive
+    entry = _entry(rng, start[3])
 
     def renew(begin: Lanes, value: Lanes) -> Lanes:
         return dr.select(ends, begin, value)
 
     return {
-        "rng": rng, "x": renew(0.0, x), "y": renew(0.0, y), "z": renew(0.0, z),
+        "rng": rng, "x": renew(entry[0], x), "y": renew(entry[1], y), "z": renew(0.0, z),
         "dx": renew(start[0], dx), "dy": renew(0.0, dy), "dz": renew(start[1], dz),
         "length": renew(0.0, s["length"] + path), "weight": renew(start[2], weight), "first": renew(1.0, first),
         "order": renew(UInt32(0), order), "path": s["path"] + dr.select(ends, UInt32(1), UInt32(0)),
