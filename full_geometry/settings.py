@@ -34,7 +34,7 @@ class Settings:
         area_share: share of the candidates for an entry that are drawn uniformly over the area, the others by a probe
             near the exit, 0 to 1; AUTOMATIC chooses by the ratio of the distance that light travels to the size of the
             object.
-        entries: points of entry that an exit draws, of which one is followed, chosen by what it may bring; AUTOMATIC
+        entries: points of entry that an exit draws; one is followed, chosen by what it may bring; AUTOMATIC
             leaves it to the model.
         light: "sampled", without bias beside that of the model; "gathered" once for all samples, see
             `integrators.gathering`: scattered light has no noise, and a little more bias; "corrected", gathered and

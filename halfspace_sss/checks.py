@@ -67,7 +67,7 @@ def check_edges(name: str, value: object) -> np.ndarray:
 
 
 def rounding(value: object) -> float:
-    """By how much a cosine may exceed 1 by rounding alone: 4 units in the last place of its own precision."""
+    """The excess of a cosine over 1 that rounding alone explains: 4 units in the last place of its own precision."""
     kind = getattr(value, "dtype", None)
     if type(value).__module__.split(".")[0] == "torch":
         import torch

@@ -28,7 +28,7 @@ def warn_left_out(group: str, name: str, error: object) -> None:
 
 
 def offers(group: str) -> dict[str, EntryPoint]:
-    """The entry points by which packages of others join a group, the first of each name; none is loaded."""
+    """The entry points of packages of others in a group, the first of each name; none is loaded."""
     results: dict[str, EntryPoint] = {}
     for entry in entry_points(group=group):
         results.setdefault(entry.name, entry)

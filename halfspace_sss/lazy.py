@@ -32,7 +32,7 @@ def lazy_names(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], 
 def once(f: Callable) -> Callable:
     """`functools.cache` under a lock: threads that ask while f runs wait for its result and do not run it again.
 
-    Mitsuba makes the objects of a scene in parallel, each of which asks for materials and models.
+    Mitsuba makes the objects of a scene in parallel, and each asks for materials and models.
     """
     cached, lock = functools.cache(f), threading.RLock()
 

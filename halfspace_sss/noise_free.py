@@ -22,7 +22,7 @@ class NoiseFree(NamedTuple):
 
     @property
     def standard_error(self) -> float:
-        """Of the error; where that is lost in noise, of its bound."""
+        """Standard error of the error, or of its bound where the error is lost in noise."""
         scale = max(self.value, math.sqrt(self.square_error), 1e-12) if self.square_error > 0 else 1.0
         return self.square_error / (2 * scale)
 

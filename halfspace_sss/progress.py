@@ -1,4 +1,4 @@
-"""The callbacks by which long work tells how far it is."""
+"""The callbacks of long work, which tell how far it is."""
 
 from __future__ import annotations
 

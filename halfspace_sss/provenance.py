@@ -184,7 +184,7 @@ def replace_together(moves: Mapping[Path, Path], gone: Iterable[Path] = ()) -> N
 
 @contextlib.contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """What the system refuses is told with the path that it was meant for."""
+    """Errors of the system name the path that was meant."""
     try:
         yield
     except OSError as error:

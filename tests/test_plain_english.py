@@ -1,9 +1,10 @@
-"""Documents and help texts are short, and without constructions that a reader has to read twice."""
+"""Documents, help texts and docstrings are short, and without constructions that a reader has to read twice."""
 
 from __future__ import annotations
 
+import ast
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from statistics import mean, median
 
@@ -26,6 +27,7 @@ BANNED = {  # construction: pattern
     "what as a noun": r"\bwhat\b(?![^.!|\n]*\?)",
     "a leading preposition or pronoun": r"(?-i:(?:^|[.!?:] |\| )(?:Of|That|It as|By) )",
 }
+IN_DOCSTRINGS = set(BANNED) - {"that of", "what as a noun"}  # which stand for a quantity where a name would repeat one
 
 
 def _prose(text: str) -> str:
@@ -41,11 +43,11 @@ def _sentences(text: str) -> list[str]:
     return [part for line in lines for part in re.split(r"(?<=[.!?])\s+", line.lstrip("-* ")) if part.strip()]
 
 
-def _found(text: str) -> list[str]:
+def _found(text: str, names: Collection[str] = tuple(BANNED)) -> list[str]:
     return [
         f"{name}: {text[max(0, at.start() - 30) : at.end() + 30]!r}"
-        for name, pattern in BANNED.items()
-        for at in re.finditer(pattern, text, flags=re.M | re.I)
+        for name in names
+        for at in re.finditer(BANNED[name], text, flags=re.M | re.I)
     ]
 
 
@@ -56,6 +58,27 @@ def _help() -> Iterator[tuple[str, str]]:
         yield name, command.help or ""
         for parameter in command.params:
             yield f"{name} {parameter.name}", getattr(parameter, "help", None) or ""
+
+
+def _docstrings(node: ast.Module | ast.ClassDef) -> Iterator[str]:
+    """Docstrings of a module or class and of the public names in it."""
+    yield ast.get_docstring(node) or ""
+    for each in node.body:
+        if isinstance(each, (ast.FunctionDef, ast.ClassDef)) and not each.name.startswith("_"):
+            yield from _docstrings(each) if isinstance(each, ast.ClassDef) else [ast.get_docstring(each) or ""]
+
+
+def test_docstrings_have_no_banned_construction() -> None:
+    paths = [path for package in ("halfspace_sss", "full_geometry") for path in (ROOT / package).rglob("*.py")]
+    wrong = {
+        str(path.relative_to(ROOT)): [
+            found
+            for text in _docstrings(ast.parse(path.read_text(encoding="utf-8")))
+            for found in _found(_prose(text), IN_DOCSTRINGS)
+        ]
+        for path in paths
+    }
+    assert not {path: found for path, found in wrong.items() if found}
 
 
 def test_documents_have_no_banned_construction() -> None:

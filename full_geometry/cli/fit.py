@@ -130,7 +130,7 @@ def as_json(found: MaterialFit) -> dict[str, Any]:
 def texture_files(
     scene: Path, name: str | None, found: MaterialFit, stem: Path
 ) -> tuple[dict[str, Path], dict[Path, bytes]]:
-    """By parameter, or `mesh`, the files of textures; and these."""
+    """The files of textures by parameter, or `mesh`; and these."""
     from full_geometry.inverse.textures import painted_mesh
     from full_geometry.scenes.reference_store import as_exr
 

@@ -74,7 +74,7 @@ class TransportOptions:
     train_error: Annotated[float, typer.Option(help="Error at which an object is trained enough.")] = 0.03
 
     def settings(self, denoise: bool) -> dict[str, Any]:
-        """Of the integrator, those that are given."""
+        """Settings of the integrator that are given."""
         given = {"light": self.light, "layers": denoise or None}
         return {name: value for name, value in given.items() if value is not None}
 

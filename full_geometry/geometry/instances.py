@@ -51,7 +51,7 @@ class Group:
 
     @functools.cached_property
     def longest(self) -> float:
-        """The largest factor by which an instance stretches a length."""
+        """The largest stretch of a length in an instance, a factor."""
         return float(np.linalg.norm(self.to_world[:, :3, :3], ord=2, axis=(1, 2)).max())
 
     @functools.cached_property
@@ -94,7 +94,7 @@ def shapes_of(scene: mi.Scene, groups: Sequence[Group]) -> list[mi.Shape]:
 
 @dataclass(frozen=True, eq=False)
 class InstanceTable:
-    """Numbers of shapes and of their instances in a scene, by which tables of kernels are looked up.
+    """Numbers of shapes and of their instances in a scene, for look-ups in tables of kernels.
 
     Args:
         shapes: each once.

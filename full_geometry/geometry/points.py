@@ -145,7 +145,7 @@ def of_rows(kind: type, rows: np.ndarray) -> mi.Vector3f | mi.Spectrum:
 def channel_mean(value: mi.Spectrum) -> mi.Float:
     """Mean over the channels of a colour.
 
-    By `drjit.mean` the number of lanes is part of a kernel, which is then compiled anew for every size of an image.
+    With `drjit.mean` the number of lanes is part of a kernel, which is then compiled anew for every size of an image.
     """
     return dr.sum(value) / len(value)
 

@@ -6,7 +6,7 @@ coordinates in it, points are within
 
     e = eps (16 h + 3 c),    eps = 2^-24,
 
-and rays that begin so far above one side do not meet the surface there again. Of shapes that Mitsuba leaves the points
+and rays that begin so far above one side do not meet the surface there again. For shapes that Mitsuba leaves the points
 of where the ray has put them, which are no meshes, spheres or disks, it is 256 h, and 2 t more after a ray of length t.
 Rays of Mitsuba begin 1500 eps (1 + c) away, in whatever unit a scene has: in metres, or at a metre from the origin,
 beyond a leaf of 0.1 mm.

@@ -30,7 +30,7 @@ class Faces:
         normals: array (n, 3), normal times area of each face, by its winding.
         pieces: integer array (n,), the connected piece of each face, over shared positions; over shared edges where
             faces point to both sides.
-        sides: array (n,) of 1 and -1, by which normals of each piece have to be multiplied to point to one side; None
+        sides: array (n,) of 1 and -1, the factors that turn normals of each piece to one side; None
             where they do.
         closed: whether an even number of faces meets at each edge, so that what enters leaves again.
     """

@@ -1,4 +1,4 @@
-"""Snapshots of objects of Mitsuba, by which a later edit is seen, and digests, by which a scene is known again.
+"""Snapshots of objects of Mitsuba, which show a later edit, and digests, which identify a scene.
 
 Values count, by checksums of their bytes. The numbers that Dr.Jit gives to its variables tell nothing: they are given
 again once a variable is freed. Neither would values that are kept: NumPy's views of them write into them.
@@ -100,7 +100,7 @@ def scene_hash(scene: mi.Scene, integrator: mi.Integrator) -> str:
     """SHA-256 of the objects of a scene, in words and by all their parameters, and of the integrator that renders it.
 
     The integrator of the scene itself, ids, the order of objects and the number of samples of a sampler are left out.
-    What models have learnt is told by `scenes.reference.learnt`.
+    For the weights of models see `scenes.reference.learnt`.
     """
     own = scene.integrator()
     result = sorted(object_digest(child) for child in children(scene) if child is not own)

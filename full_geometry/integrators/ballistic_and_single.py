@@ -7,7 +7,7 @@ reflected at the boundary by Fresnel as often as it takes, and leaves. After k =
 
 p the density of the walk; the factors eta² of radiance cancel, and Fresnel's inside with the probability of reflection.
 Whether a segment is passed, and where and how the walk is scattered, is drawn for the channels by their weights f_c so
-far. Of events some are drawn nearer the boundary, and of directions some towards it: that light is little attenuated.
+far. Some events are drawn nearer the boundary, and some directions towards it: that light is little attenuated.
 This is no `walk.random_walk`, whose free flights mostly end in events that are scattered again and count nothing: with
 at most one event that has 1.8 to 11 times the variance x time of this on five of six test scenes, and 0.3 on a dark
 bunny under a large lamp.

@@ -125,7 +125,7 @@ class Corrections:
             scene: of Mitsuba.
             objects: with gathered light.
             settings: of the integrator.
-            samples: of the image, by which there are walks.
+            samples: of the image, which set the number of walks.
 
         Raises:
             ValueError: the light of an object cannot be corrected.
@@ -153,7 +153,7 @@ class Corrections:
         return self._found
 
     def told(self) -> list[str]:
-        """Of each object: walks, and error."""
+        """A line for each object: walks, and error."""
         return [known.told for known in self._known if known is not None]
 
 
@@ -235,6 +235,6 @@ def _steadied(r: np.ndarray, a: np.ndarray) -> np.ndarray:
 
 
 def scale_of(gathered: Gathered) -> np.ndarray:
-    """Mean of a(w) mu of each channel over that of all, by which residuals of all channels are alike."""
+    """Mean of a(w) mu of each channel over that of all, which makes residuals of all channels alike."""
     whole = np.maximum(gathered.albedo.whole, LEAST_ALBEDO)
     return whole / whole.mean()

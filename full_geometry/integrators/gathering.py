@@ -131,7 +131,7 @@ class Gathered:
         )
 
     def kept(self, other: Gathered) -> float:
-        """Of the variance of two parts the share that all samples have."""
+        """The share of the variance of two parts that all samples have."""
         # Var = Var_light + Var_matrix, by one of both exchanged at a time
         B = self.matrix @ self.light
         by_light = ((B - self.matrix @ other.light) ** 2).mean()
@@ -191,7 +191,7 @@ class Gathering:
         return self._found
 
     def kept(self, other: Gathering, k: int) -> float:
-        """Of the variance of parts of an object's light, the share that gathering with all samples has.
+        """The share of the variance of parts of an object's light that gathering with all samples has.
 
         Args:
             other: another part of the same scene.
@@ -201,7 +201,7 @@ class Gathering:
         return 1.0 if one is None else one.kept(other._found[k].gathered)
 
     def told(self) -> list[str]:
-        """Of each object: points, memory, and noise."""
+        """A line for each object: points, memory, and noise."""
         results = [obj.gathered for obj in self._found if obj.gathered is not None]
         return [f"light of object {g.object.geometry.name} {g.told}" for g in results]
 

@@ -149,7 +149,7 @@ def _steadied(sums: np.ndarray) -> np.ndarray:
 
 
 def cut_to_next(values: np.ndarray, brightest: float) -> np.ndarray:
-    """Values (n, ...) of which a share, the brightest, has the size of the next one; as they are where that is 0."""
+    """Values (n, ...) whose brightest share is cut to the size of the next one; as they are where that is 0."""
     # size: the largest |number| of each of the n
     size = np.abs(values).max(axis=tuple(range(1, values.ndim)), keepdims=True)
     most = np.quantile(size, 1 - brightest)

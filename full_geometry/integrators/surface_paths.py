@@ -71,7 +71,7 @@ class PreviousVertex:
 
 @dataclass
 class NextVertex:
-    """The ray by which a path leaves a vertex, and what it is worth."""
+    """The ray of a path from a vertex to the next, and what it is worth."""
 
     previous: PreviousVertex  # the origin of the ray
     d: mi.Vector3f  # direction of the ray
@@ -725,7 +725,7 @@ def resample_entry(
 ) -> Candidate:
     """One entry for light that leaves at `out`, by resampled importance sampling (Talbot, Cline and Egbert 2005).
 
-    Of N candidates with weights W_k = S mu_i / density, one is kept with the probability w_k / Σ w, with w_k the
+    One of N candidates with weights W_k = S mu_i / density is kept with the probability w_k / Σ w, with w_k the
     resampling target: the largest channel of W_k times the light of a sampled emitter. Its weight is W_k Σ w / (N w_k),
     the mean of all candidates. The ray that goes on tests the visibility of the one kept.
     """

@@ -190,7 +190,7 @@ class LightVisitor:
     def surface(
         self, walk: Walk, record: LightRecord, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32
     ) -> tuple[Walk, LightRecord]:
-        """Light that the surface emits, of which nothing was sampled, and of inner lights at it."""
+        """Light that the surface emits, where none was sampled, and of inner lights at it."""
         # L += throughput L_e, and for the inner lights throughput f E
         emitter = si.emitter(self.scene)
         shines = si.is_valid() & (k != walk.object) & (emitter != None)  # noqa: E711
@@ -345,7 +345,7 @@ def _plus(record: LightRecord, walk: Walk, light: mi.Spectrum, slopes: Score | t
 
 
 def start_record(lanes: int, scored: bool = False, forward: bool = False) -> LightRecord:
-    """Of a path that begins at the camera."""
+    """The record of a path that begins at the camera."""
 
     def full(kind: type, value: float | bool | int) -> Any:
         return dr.full(kind, value, lanes)

@@ -180,7 +180,7 @@ class MaterialFit:
         misfit: root of the loss of all fitted views at the end.
         held_out: likewise of views held out; None without any.
         chi_square: of the fitted views.
-        exposures: factor by which each view's image of the medium is multiplied to match the given one.
+        exposures: factor of each view's image of the medium that matches the given one.
         is_misfit: whether more than noise is between images and renders.
         told: sentences about that, about bounds, and about what the images do not tell.
         steps: the way there.
@@ -250,7 +250,7 @@ class ViewComparison:
 
     Args:
         scene, views, settings: as of `fit`, checked.
-        factors: of each view, changed in place: by which its render becomes its image, up to one common factor.
+        factors: of each view, changed in place: of its render to its image, up to one common factor.
         shown: of views that were met, changed in place: B, without exposure.
     """
 

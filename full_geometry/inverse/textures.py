@@ -17,7 +17,7 @@ model has the medium at both ends, J is not its Jacobian; the residuals are its 
 where these vanish. A constant is a texture of one texel.
 
 Standard errors are those of minima that noise moves: the residuals of the last steps and the noise of the means, drawn
-anew `DRAWS` times. That holds noise, and not what pixels do not resolve, nor what `tv` smooths away.
+anew `DRAWS` times. It holds noise, and not what pixels do not resolve, nor what `tv` smooths away.
 """
 
 from __future__ import annotations

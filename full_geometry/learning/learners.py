@@ -135,7 +135,7 @@ class ObjectLearner:
     ) -> list[ObjectError]:
         """As `Learner.errors`, also of other models that know objects; the truth of each kind of orders is traced once.
 
-        By default of all that have learnt the object or take its medium.
+        The default is all that have learnt the object or take its medium.
         """
         check_count("seed", seed, 0)
         check_count("exits", exits, 2)

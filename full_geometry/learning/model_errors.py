@@ -231,7 +231,7 @@ def errors_of(
 ) -> dict[str, list[RadianceError]]:
     """The errors of several transports of an object, by name; the truth is traced once for all of the same orders.
 
-    Of those that have learnt what uniform light leaves also the error of images under an even sky.
+    Those that have learnt what uniform light leaves have the error of images under an even sky too.
 
     Args:
         obj: the object.
@@ -338,7 +338,7 @@ class MeanRatio(NamedTuple):
 
 
 def mean_ratios(scene: mi.Scene, image: np.ndarray, sensor: int = 0, seed: int = 0) -> list[MeanRatio]:
-    """Of each translucent object that enough places of the film show.
+    """The ratio of each translucent object that enough places of the film show.
 
     Args:
         scene: whose integrator tells mm_per_unit and max_depth.

@@ -264,7 +264,7 @@ class Recipe:
         return replace(self, base_model=name, rate=RATES.get(name, self.rate))
 
     def refining(self) -> Recipe:
-        """The same for weights that begin near: smaller steps, and chunks of which seconds make several."""
+        """The same for weights that begin near: smaller steps, and chunks of a fraction of a second."""
         return replace(self, rate=self.rate / REFINING, chunk=max(self.chunk // REFINING, self.batch))
 
 
@@ -369,7 +369,7 @@ class ObjectFit:
 
         Args:
             source: of the proposals.
-            chunks: of the training, half as many of which are made.
+            chunks: of the training; half as many are made.
             seed: of the training.
         """
         for k in range(max(round(SOLVED * chunks), 1)):

@@ -162,7 +162,7 @@ class ShapeFit:
     def loss(self, batch: list[GroupedPairs], rng: np.random.Generator) -> torch.Tensor:
         """E_q[(S_0 mu_i / q) exp f] - E_walks[T f] over the mean of T, and the light of groups; a mean over objects.
 
-        Of each object a part of one group of its exits is taken.
+        A part of one group of the exits of each object is taken.
         """
         parts = [data.part(self.recipe.pairs, rng) for data in batch]
         T, W = (torch.from_numpy(np.concatenate(v)).float() for v in zip(*((p.T, p.W) for p in parts)))

@@ -50,7 +50,7 @@ class Inclusion:
 
 
 def find_inclusions(scene: mi.Scene, objects: list[Geometry]) -> list[Inclusion]:
-    """Find what lies inside each closed object of a scene: shapes of which a part is deeper than `DEEP`, and lamps.
+    """Find what lies inside each closed object of a scene: shapes with a part deeper than `DEEP`, and lamps.
 
     What shines or lets light through counts from the depth on that rays tell.
 

@@ -173,7 +173,7 @@ def outermost(scene: mi.Scene) -> list[mi.Shape]:
 
 
 def places_of(scene: mi.Scene) -> list:
-    """Snapshots of shapes, those of groups too, and places of lamps of a scene, by which a move is seen."""
+    """Snapshots of shapes, those of groups too, and places of lamps of a scene, which show a move."""
     shapes = [node for node in mi.traverse(scene).hierarchy if isinstance(node, mi.Shape)]
     lamps = [place_of(emitter) for emitter in scene.emitters()]
     return [*map(geometry_of, shapes), *(None if place is None else place.tolist() for place in lamps)]

@@ -1,7 +1,7 @@
-"""The split of a phase function, by which light that has only been scattered forwards counts as unscattered.
+"""The split of a phase function: light that has only been scattered forwards counts as unscattered.
 
 A grid holds the directions of light by few numbers: fluence, flux and second moments. A phase function p that is
-narrow asks for more of them. It is parted into a quadratic Q of the cosine c, of which these numbers are all that
+narrow asks for more of them. It is parted into a quadratic Q of the cosine c, whose moments above are all that
 matters, and a rest p_f, which is forward:
 
     p = Q + p_f,    Q(c) = sum_(l <= 2) (2 l + 1) / (4 pi) q_l P_l(c).
@@ -10,7 +10,7 @@ The light that is precomputed, L_f, has met forward events alone: a ray of light
 1 - q(c), q = Q / p. At each of its events a walk adds weight ∫ Q L_f dw'. The first event that is not forward, seen
 from the light, parts all paths, so that nothing is counted twice: what a walk meets when it leaves counts by the
 product of 1 - q over its turns. L_f is smooth and reaches as deep as 1 / (q_0 sigma_s + sigma_a). The split is exact
-for any Q, unlike similarity relations, of which it has the lengths. Q decides the noise alone: that of light which
+for any Q, unlike similarity relations, whose lengths it has. Q decides the noise alone: that of light which
 walks meet when they leave grows with E[(1 - q)²], most where they turn. It is therefore the quadratic with the least
 ∫ (p - Q)² / p (1 - c)³ dc, within 1.5 % by polynomials of g; less weight on turns has a tenth less variance and more
 samples below zero. For Henyey-Greenstein functions q_0 is .67, .23, .11 at g = .5, .8, .9, and 1 - g near 1;
@@ -87,7 +87,7 @@ class ForwardRun:
 
     @classmethod
     def none(cls, lanes: int) -> ForwardRun:
-        """Of no event."""
+        """The split of no event."""
         return cls(
             dr.full(mi.Spectrum, 1, lanes), dr.full(mi.Vector3f, 0, lanes), dr.full(mi.Spectrum, 0, lanes),
             dr.full(mi.Bool, False, lanes),

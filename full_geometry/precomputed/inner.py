@@ -192,7 +192,7 @@ class InnerLight:
 
     @classmethod
     def of(cls, obj: TranslucentObject, events: Events, values: np.ndarray) -> InnerLight:
-        """By ∫ Y_lm(w) L dw at events, (events, bands, channels)."""
+        """Inner light from ∫ Y_lm(w) L dw at events, (events, bands, channels)."""
         planes = events.fitted(values.reshape(len(values), -1))
         g = tuple(float(m.g) for m in obj.media)
         return cls(events, mi.Float(planes.astype(np.float32).ravel()), bands(obj), g)

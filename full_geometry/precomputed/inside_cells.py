@@ -109,7 +109,7 @@ class InsideCells:
         )  # fmt: skip
 
     def fit(self, D: np.ndarray) -> np.ndarray:
-        """Of least squares over the inside, the value at the centre of each cell and its slopes by units of h.
+        """The fit of least squares over the inside: the value at the centre of each cell and its slopes by units of h.
 
         Args:
             D: (slots, channels, 4) ∫ f x_j dx / h³ over the inside of each cell, x about its centre.
@@ -161,7 +161,7 @@ def _added(values: np.ndarray, parent: np.ndarray) -> np.ndarray:
 
 
 def grid_edge(box: tuple[np.ndarray, np.ndarray], h: float) -> float:
-    """h, or the least edge of cells by which a grid has no more than MOST_CELLS."""
+    """h, or the least edge of cells whose grid has at most MOST_CELLS."""
     size = box[1] - box[0]
     while np.prod(np.ceil(size / h + 2 * MARGIN) + 2) > MOST_CELLS:
         h *= 1.05

@@ -1,6 +1,6 @@
 """Pairs of places between which S is asked once more, along directions that light comes from at the entry.
 
-Of the entries of each point a few are chosen in proportion to the light that they bring, and for each one of the
+A few entries of each point are chosen in proportion to the light that they bring, and for each one of the
 directions that light was gathered along where it is: by systematic sampling, as the entries themselves.
 """
 

@@ -61,7 +61,7 @@ class ResidualSums:
 
     @classmethod
     def zeros(cls, points: int, channels: int) -> ResidualSums:
-        """Of no residuals."""
+        """Sums of no residuals."""
         return cls(np.zeros(points), np.zeros((points, TERMS, TERMS)), np.zeros((points, TERMS, channels)),
                    np.zeros(channels))  # fmt: skip
 
@@ -69,7 +69,7 @@ class ResidualSums:
     def of(
         cls, point: np.ndarray, w: np.ndarray, a: np.ndarray, r: np.ndarray, light: np.ndarray, points: int
     ) -> ResidualSums:  # fmt: skip
-        """Of residuals r (n, channels) of light (n, channels) in directions w (n, 3) at points.
+        """Sums of residuals r (n, channels) of light (n, channels) in directions w (n, 3) at points.
 
         Their factors a (n, channels) are above 0.
         """
@@ -104,7 +104,7 @@ class Level:
     Args:
         centre: number of the point of each centre.
         h: reach.
-        size: of the object, by which features have places.
+        size: of the object, the unit of places of features.
         weights: (centres, points).
     """
 

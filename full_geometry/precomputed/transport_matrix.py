@@ -4,7 +4,7 @@ Directions are taken apart: with the directional albedo a(mu) of the model,
 
     S(x_i, w_i; x_o, w_o) ~ a(w_o) q(x_i, x_o) a(w_i),    L_o(x_o, w_o) = a(w_o) B(x_o),    B_j = Σ_s t_js L_k(j,s),
 
-L_k the mean of the incident radiance at point k, weighted by a(mu_i) mu_i. Of each point j the entries s are drawn by
+L_k the mean of the incident radiance at point k, weighted by a(mu_i) mu_i. The entries s of each point j are drawn by
 the distance from it, see `entries`, with directions at both ends, so that under the same light from everywhere the sum
 is an unbiased estimate of what the model gives. Where the model knows its directional albedo (`alpha`), the mean
 radiance c of the environment leaves by that, as in `integrators.lighting.EnvironmentMean`, and rows have but the rest
@@ -90,7 +90,7 @@ LATTICE = 128  # directions of a hemisphere
 
 
 def cosine(w: mi.Vector3f, n: mi.Normal3f, n_out: mi.Normal3f) -> mi.Float:
-    """Of a direction to the shading normal; 0 below the surface of geometric normal n."""
+    """Cosine of a direction to the shading normal; 0 below the surface of geometric normal n."""
     return dr.select(dr.dot(w, n) > 0, dr.abs(dr.dot(w, n_out)), 0)
 
 
@@ -125,7 +125,7 @@ class Albedo:
 
     @property
     def least(self) -> np.ndarray:
-        """Of what weights are divided by, per channel."""
+        """The least divisor of weights, per channel."""
         return (LEAST / np.pi * self.whole).astype(np.float32)
 
 
@@ -170,7 +170,7 @@ class Hemispheres(NamedTuple):
 
     @classmethod
     def of(cls, points: SurfacePoints, albedo: Albedo) -> Hemispheres:
-        """By a lattice of directions: of the few that light is gathered along they would be too noisy."""
+        """Means over a lattice of directions: the few that light is gathered along would be too noisy."""
         # directions w of a lattice by the cosine, of density mu / pi, so that a mu / density = pi a
         k, each = dr.arange(mi.UInt32, len(points) * LATTICE), dr.opaque(mi.UInt32, LATTICE)
         j, s = k // each, mi.Float(k % each)
@@ -209,7 +209,7 @@ class TransportMatrix:
         error: standard error of the sums of rows over their mean, worst channel, root mean square.
         e: exponent of the reflectance at the exit, per channel.
         trusted: channels in which alpha is what uniform light brings.
-        pairs: by which S is asked again.
+        pairs: for which S is asked again.
         unit: t over S / a(mu_i), (points, samples, channels).
     """
 

@@ -116,7 +116,7 @@ def _keep(path: Path, reference: Reference) -> None:
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of a run, the first of which ends it, and how it goes there; None is no limit.
+    """Limits of a run, whichever comes first, and how it goes there; None is no limit.
 
     Args:
         spp: samples per pixel in all.

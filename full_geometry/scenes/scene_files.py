@@ -35,7 +35,7 @@ _TRACEBACK = "Traceback (most recent call last):"
 
 
 def first_cause(error: BaseException) -> str:
-    """One line: where in the scene file, if that is told, and what was wrong there first."""
+    """One line: where in the scene file, if that is known, and what was wrong there first."""
     while error.__cause__ is not None or error.__context__ is not None:
         error = error.__cause__ or error.__context__
     text = str(error)
@@ -55,7 +55,7 @@ def first_cause(error: BaseException) -> str:
 
 
 class SceneError(ValueError, RuntimeError):
-    """A refusal by a plugin of this project, in place of the RuntimeError by which Mitsuba hands it on."""
+    """A refusal by a plugin of this project, in place of the RuntimeError that Mitsuba makes of it."""
 
 
 def plainly(function: Callable) -> Callable:

@@ -114,7 +114,7 @@ class TexturedMedium:
         table: albedo by reflectance.
         inverse: whether `sigma_t` is a mean free path.
         variables: of these names, by whose numbers light may be differentiated: those that no texture varies, and
-            others in place of texels, all of which then change alike.
+            others in place of texels, which then all change alike.
     """
 
     albedo: mi.Texture | np.ndarray
@@ -221,7 +221,7 @@ class TexturedMedium:
     def is_even(self, shape: mi.Shape) -> bool:
         """Whether its textures are the same everywhere on a shape, and no derivatives by them are followed.
 
-        Models are then those of the medium itself, of which they are 0.3 % off between nodes of the albedo.
+        Models are then those of the medium itself, which differ by 0.3 % between nodes of the albedo.
         """
         values = [
             np.concatenate([texels(texture), attributes(name, texture, shape)])
@@ -397,7 +397,7 @@ def check_values(name: str, values: np.ndarray, hint: str = "") -> None:
 
 
 def textured_medium(values: dict[str, Any], g: np.ndarray | float, eta: float, channels: int) -> TexturedMedium:
-    """The medium of parameters of which at least one is a texture.
+    """The medium of parameters with at least one texture.
 
     Args:
         values: `albedo` and `sigma_t`, with or without `scale`, or `reflectance` and `mfp`; textures, or numbers.

@@ -494,7 +494,7 @@ class MediumSpec:
         return replace(self, label="medium", medium=Medium.from_albedo(**new, eta=m.eta))
 
     def with_variables(self, surface: mi.BSDF, **more: mi.Spectrum) -> MediumSpec:
-        """The same, with numbers beside textures as the surface has them, by which light may be differentiated."""
+        """The same, with numbers beside textures as the surface has them, for derivatives by them."""
         if self.textured is None:
             return self
         variables = {name: getattr(surface, name) for name in self.constants if name != "g"}

@@ -83,7 +83,7 @@ def constant_value(value: Any) -> Any:
 
 
 def varying_medium(sigma_t: Coefficient, albedo: Coefficient, scale: Coefficient, channels: int) -> VaryingMedium:
-    """The medium of parameters of which at least one is a grid volume.
+    """The medium of parameters with at least one grid volume.
 
     Args:
         sigma_t: 1/mm, a grid volume, a number or one per channel.

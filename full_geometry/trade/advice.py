@@ -47,7 +47,7 @@ class Option:
 
 @dataclass(frozen=True)
 class ObjectAdvice:
-    """The way for one object; None where nothing can be told. `options` has all of them, the chosen one first."""
+    """The way for one object; None where nothing is known. `options` has all of them, the chosen one first."""
 
     object: str
     way: str | None

@@ -64,12 +64,12 @@ def assess(
 
     At points of an object that the camera sees, radiance by each technique is compared with that by random walks, with
     the noise of both taken out; time is that of the same samples. Lights, reflections and other objects are those of
-    the scene, at its own largest depth. For a job, biases under an environment map are told by a smoothed one, see
+    the scene, at its own largest depth. For a job, biases under an environment map are measured by a smoothed one, see
     `SmoothedEnvironment`; the map of a loaded scene is edited meanwhile, and put back.
 
     Args:
         scene: a Mitsuba scene, a dict as for `mitsuba.load_dict`, or the path of an XML file.
-        models: names of techniques, such as "neural" or "neural, gathered", all of which are measured; by default all,
+        models: names of techniques, such as "neural" or "neural, gathered", which are all measured; by default all,
             or for a job those of `CANDIDATES` that might be the cheapest for it. "path_traced" is always among them.
         job: most of the time is then for walks and for techniques that might be the cheapest to keep its tolerance.
         flip: whether to render small images for FLIP, if the evaluator is installed.
@@ -125,7 +125,7 @@ def assess_for(
     """As `assess_stage`, with most of the time for techniques that could be the cheapest to keep a tolerance.
 
     Techniques that cannot be the cheapest for the job are left out by what few samples of others say; with `every` all
-    are measured. The time is that of all that is done, and points are fewer where walks are noisy. Biases are told by
+    are measured. The time is that of all that is done, and points are fewer where walks are noisy. Biases are known by
     a smoothed environment, see `SmoothedEnvironment`.
     """
     with on.with_smoothed_environment() as smoothed:
@@ -337,7 +337,7 @@ def left_out(assessed: ObjectTrade, technique: Technique, job: Job, seconds: flo
 
 
 def most_promising(seen: Sequence[ObjectTrade], wanted: Sequence[Technique], job: Job) -> Technique:
-    """The technique by which the job is expected to end first.
+    """The technique that is expected to end the job first.
 
     It keeps the tolerance by the chance that its model does, and takes what gathering takes then, else what the
     cheapest of the other techniques does.

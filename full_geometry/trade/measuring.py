@@ -69,7 +69,7 @@ class RunBudget(NamedTuple):
         seconds: for each object; with 0 the first samples are all.
         samples: of each exit, instead.
         traced: share of the walks.
-        own: share of the light of the scene, where biases are told by a smoothed environment.
+        own: share of the light of the scene, where biases are measured by a smoothed environment.
     """
 
     seconds: float = 0.0
@@ -169,7 +169,7 @@ class SceneSamples:
     def keep(self, walked: Assessment) -> None:
         """Keep fewer points where walks are noisy or slow.
 
-        Of a bias² b² n points leave errors of about b² sqrt(2 / n) by their choice and V t sqrt(2 n) / time by noise,
+        For a bias² b², n points leave errors of about b² sqrt(2 / n) by their choice and V t sqrt(2 n) / time by noise,
         which are equal for n = time b² / (V t).
         """
         for k, o in enumerate(walked.objects):

@@ -25,7 +25,7 @@ class TechniqueTrade:
     Attributes:
         way: its name.
         bias2: squared relative error of radiance that no number of samples removes, noise taken out; it may come out
-            below 0. Mean over visible exits and channels, over the square of the mean radiance. By a smoothed
+            below 0. Mean over visible exits and channels, over the square of the mean radiance. With a smoothed
             environment map, where a tolerance is asked, as `ratio` is: see `SmoothedEnvironment`.
         bias2_error: its standard error.
         ratio, ratio_error: mean radiance over that of walks, for each channel, with standard errors.
@@ -99,7 +99,7 @@ class TechniqueTrade:
 
 
 def samples_for(row: TechniqueTrade, tolerance: float) -> float:
-    """Samples n of a pixel by which bias² + variance / n and z of its standard errors are at tolerance²; inf for none.
+    """Samples n of a pixel that bring bias² + variance / n and z of its standard errors to tolerance²; inf for none.
 
     With a = tolerance² - bias² and z = DOUBT the smaller root of (a - V / n)² = z² (s² + (v / n)²).
     """
@@ -121,7 +121,7 @@ class ObjectTrade:
         pixels: of the film that it fills.
         radiance: its mean, for each channel.
         ways: what was found, path traced first.
-        notes: what cannot be told, and warnings.
+        notes: what cannot be known, and warnings.
     """
 
     object: str

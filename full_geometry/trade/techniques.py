@@ -1,4 +1,4 @@
-"""The techniques by which a scene can be rendered one after the other, for which job, and by which light."""
+"""The techniques of rendering, in turn on one scene, and the job and the light of a measurement."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Technique:
 
     @property
     def exact(self) -> bool:
-        """Whether it is walks with sampled light, by which biases are told."""
+        """Whether it is walks with sampled light, the reference of biases."""
         return self.walks and self.light == "sampled"
 
     @property
@@ -108,7 +108,7 @@ class Stage:
         settings: of its integrator, by parameter name.
         bssrdf: parameters that `bssrdf` alone understands.
         paces: first `Sampled` of earlier runs by (object, technique), so that the next run knows what a sample takes.
-        smoothed: environment by which biases are told; None where the light of the scene tells them.
+        smoothed: environment that biases are measured by; None where the light of the scene does it.
     """
 
     scene: mi.Scene
@@ -242,7 +242,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Effort:
-    """The effort by which a scene is measured.
+    """The effort of the measurement of a scene.
 
     Args:
         seconds: for each object, shared by all techniques, compilation left out.

@@ -418,7 +418,7 @@ def load(path: Path) -> dict[str, np.ndarray]:
 
 
 def checksums(obj: TranslucentObject, path: str | os.PathLike | None = None) -> tuple[str, ...]:
-    """Of the shipped weights or others, and of those of the half-space models that they correct."""
+    """Checksums of the shipped weights or others, and of those of the half-space models that they correct."""
     models = [bssrdf(MODEL, m) for m in obj.media]
     own = checksum_of(Path(path) if path is not None else shipped_weights(), KIND)
     return (own, *(checksum for m in models for checksum in m.checksums))

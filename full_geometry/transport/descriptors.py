@@ -1,4 +1,4 @@
-"""What the network of all shapes is told of a pair of points, free of place, turn and scale.
+"""Inputs of the network of all shapes for a pair of points, free of place, turn and scale.
 
 Light that is mixed in what is thin, lines between two points, what rays measure around an end, and the descriptors.
 """
@@ -47,7 +47,7 @@ LEAST_ESCAPE = 1e-6
 
 
 class Mixed(NamedTuple):
-    """Of a channel: M, 1/(scene unit)²; m_2; the mean chord in transport mean free paths; q, q', q_d and k."""
+    """Those of a channel: M, 1/(scene unit)²; m_2; the mean chord in transport mean free paths; q, q', q_d and k."""
 
     M: float
     m_2: float

@@ -143,7 +143,7 @@ def _varied(obj: TranslucentObject, p: mi.Point3f) -> tuple[mi.Float, ...]:
 
 
 def first_event(obj: TranslucentObject, at: SurfacePoint, active: mi.Bool = True) -> FirstEvent:
-    """Of light that goes in or out along w at a point of the surface."""
+    """The first event of light that goes in or out along w at a point of the surface."""
     sigma_t = obj.sigma_t if obj.textured is None else at.medium.sigma_t
     eta, sign = obj.eta, opaque(obj.geometry.sign)
     media, inclusions = walk_media(obj), obj.geometry.inclusions
@@ -353,7 +353,7 @@ class ObjectFrame:
 
 
 def n_side(channels: int, local: int = 0) -> int:
-    """Number of features of a side, of which `local` are what varies."""
+    """Number of features of a side; `local` of them are what varies."""
     return P_0 + channels + local + 2 * FIELDS
 
 

@@ -42,7 +42,7 @@ class ReflectanceTable:
     """R of the medium at an exit whose object has textures, by a table of ln(R / albedo) over x.
 
     Args:
-        media: of each channel, of which g and eta hold.
+        media: of each channel; their g and eta hold.
     """
 
     def __init__(self, media: Sequence[Medium]) -> None:

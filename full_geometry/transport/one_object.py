@@ -116,7 +116,7 @@ class HalfSpace:
 
 @dataclass(frozen=True, eq=False)
 class DirectionalAlbedo:
-    """Of one object.
+    """The directional albedo of one object.
 
     Args:
         obj: the object.
@@ -139,7 +139,7 @@ class DirectionalAlbedo:
         return tuple(Perceptron(*part, looped=True) for part in parts)
 
     def units(self, columns: list[mi.Float]) -> list[mi.Float]:
-        """What the last layer is told of a side with these features."""
+        """Inputs of the last layer for a side with these features."""
         net = self._networks[0]
         return net.numbers(net.activation(net.vector(net(columns))))
 

@@ -13,7 +13,7 @@ albedos, so that kernels serve textures that change.
 Networks cost more than all else, and each node would be one. So `neural` has the backbone of the albedo itself, and two
 networks for all nodes (`neural.reduced`), asked at the distances of the channels in mean free paths where extinction is
 the same at both ends. Where it is not, they are asked at three distances, Chebyshev's in the logarithm over the range
-of those of all channels and ends, and their outputs are interpolated. That changes S by 0.03, 0.2, 0.4 and 0.5 % in the
+of those of all channels and ends, and their outputs are interpolated. This changes S by 0.03, 0.2, 0.4 and 0.5 % in the
 mean of its magnitude, where extinctions differ by factors of 2, 4, 8 and 12, and its integral by 0.04 %. Where they
 differ by more, networks are asked for all distances.
 
@@ -119,7 +119,7 @@ class Distances:
         return cls(every, [dr.exp(middle + half * t) for t in _places(count)], middle, half)
 
     def interpolated(self, values: list[list[mi.Float]], k: int, r: mi.Float) -> list[mi.Float]:
-        """Of the values where functions were asked those at a distance, that of `every` by number, or close to it."""
+        """At the points asked, values at a distance, that of `every` by number, or close to it."""
         if self.middle is None:
             return values[k % len(values)]
         t, ts = (dr.log(dr.maximum(r, NEAREST)) - self.middle) / self.half, _places(len(self.r))
@@ -154,13 +154,13 @@ class Palette:
 
     @classmethod
     def of(cls, name: str, albedos: np.ndarray, extinctions: np.ndarray, media: Sequence[Medium]) -> Palette:
-        """Of a model.
+        """The palette of a model.
 
         Args:
             name: of it.
             albedos: that nodes have to cover, shape (n, channels).
             extinctions: of all places, shape (n, channels).
-            media: of each channel, of which g and eta hold.
+            media: of each channel; their g and eta hold.
 
         Raises:
             ValueError: the model knows some media only.
@@ -268,7 +268,7 @@ class Palette:
         return dr.while_loop(start, lambda k, *_: active & (k < len(ends) * n), step, label="ends and channels")[1:]
 
     def reflectance(self, albedo: mi.Spectrum) -> mi.Spectrum:
-        """Of half-spaces of the orders of the models, at one cosine, interpolated as S is."""
+        """Reflectance of half-spaces of the orders of the models, at one cosine, interpolated as S is."""
         results = []
         for c, value in enumerate(albedo):
             value = dr.clip(value, 0, 1)
@@ -477,7 +477,7 @@ def palette_model(
     Args:
         name: of the model.
         geometry: the object.
-        media: of each channel, of which g and eta hold, 1/(scene unit).
+        media: of each channel, 1/(scene unit); their g and eta hold.
         medium: what varies, 1/(scene unit).
         settings: geometry and share of uniform entries.
 

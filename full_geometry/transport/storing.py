@@ -486,7 +486,7 @@ def base_model(obj: TranslucentObject, name: str) -> BaseModel:
 
 
 def base_checksums(obj: TranslucentObject, name: str) -> tuple[str, ...]:
-    """Of the weights that a base model has."""
+    """Checksums of the weights that a base model has."""
     if name == shapes.KIND:
         return shapes.checksums(obj)
     return tuple(checksum for m in obj.media for checksum in bssrdf(name, m).checksums)

@@ -73,7 +73,7 @@ def next_event(
         scene, u, active, differentiable: as of `sample_emitter`.
         instance_scene: what rays meet in the scene.
         surface: a point of a surface and its BSDF.
-        outwards: whether light arrives at its outer side alone, as at a translucent boundary. Of a rough one it may
+        outwards: whether light arrives at its outer side alone, as at a translucent boundary. At a rough one it may
             come from below the shading normal; then it is refracted from inside, by the opposite direction.
     """
     # w by the emitters of the scene, p_e; delta BSDFs have no value for it
@@ -99,7 +99,7 @@ def next_event(
 def emitter_pdf(
     scene: mi.Scene, origin: mi.Interaction3f, si: mi.SurfaceInteraction3f, active: mi.Bool
 ) -> tuple[mi.Float, mi.DirectionSample3f]:
-    """The density p_e, 1/sr, by which `sample_emitter` draws the emitter that a ray meets, and the direction to it."""
+    """The density p_e, 1/sr, of `sample_emitter` for the emitter that a ray meets and the direction to it."""
     ds = mi.DirectionSample3f(scene, si, origin)
     return scene.pdf_emitter_direction(origin, ds, active), ds
 

@@ -8,7 +8,7 @@ Three strategies find what random walks from the camera rarely hit through a ref
 
 Paths of connections. A path inside an object has scattering events v_1 ... v_n from the camera's side. An edge
 v_k v_{k+1} is straight if nothing reflects between them. A path with a straight edge is split at the last one: v_k is
-an event of the walk from the camera, v_{k+1} lies on a ray of the light subpath. That ray enters from an emitter, or it
+an event of the walk from the camera, v_{k+1} lies on a ray of the light subpath. The ray enters from an emitter, or it
 follows a reflection at the boundary. Between its events the light subpath is reflected at least once, for else an edge
 nearer to the emitter would be straight. So connections find each path from a small emitter with a straight edge in one
 way. Every other path is left to walks from the camera: no straight edge, one event or none, light that other surfaces
@@ -332,7 +332,7 @@ WIDER = (131.0, 8.0)  # concentrations of the others: 5 and 20 degrees
 
 @dataclass
 class Departure:
-    """A walk's last event and its way out from there, by which it left the object straight."""
+    """A walk's last event and its straight way out of the object from there."""
 
     p: mi.Point3f
     along: mi.Vector3f  # direction of arrival at the event

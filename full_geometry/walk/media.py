@@ -178,7 +178,7 @@ def _check_mixes(
 
 @dataclass(frozen=True, eq=False)
 class HeterogeneousMedia:
-    """The media of all objects, of which at least one varies.
+    """The media of all objects, where at least one varies.
 
     Args:
         densities: volume of each object, or None, see `VaryingMedium`.
@@ -458,7 +458,7 @@ class WalkMedia:
         return dr.gather(type(table), table, self.place_of(k))
 
     def place_of(self, k: mi.Int32) -> mi.UInt32 | mi.Int32:
-        """Of object k in tables: the same in all lanes, which is faster, where there is one object."""
+        """The place of object k in tables: the same in all lanes, which is faster, where there is one object."""
         return mi.UInt32(0) if len(self.instance_table) == 1 else k
 
     def has_shape(self, k: mi.Int32, kind: int) -> mi.Bool:

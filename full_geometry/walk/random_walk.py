@@ -200,7 +200,7 @@ class Visitor(Protocol):
     """What is recorded of a walk. Each method returns the walk, whose random numbers it may use up, and its record."""
 
     def event(self, walk: Walk, record: Record, event: Event) -> tuple[Walk, Record]:
-        """At a scattering event, of which `walk.order` came before."""
+        """At a scattering event, after `walk.order` others."""
 
     def boundary(self, walk: Walk, record: Record, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[Walk, Record]:
         """At the boundary from inside, where the walk may leave if `active`."""

@@ -112,7 +112,7 @@ class StayRecord:
 class KeptStays:
     """The stays of each path in textured objects, in slots: one after another those of all paths.
 
-    Of a path with more of them the last slot keeps one, drawn evenly from those that are left, times their number.
+    Where a path has more of them, the last slot keeps one, drawn evenly from the rest, times their number.
 
     Args:
         paths: their number.

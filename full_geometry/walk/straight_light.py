@@ -71,11 +71,11 @@ class StraightLight:
         return FARTHEST / dr.min(self.media.coefficients(k, p, medium).mean_t)
 
     def pdf(self, k: mi.Int32, p: mi.Point3f, cosine: mi.Float, medium: WalkMedium | tuple[()] = ()) -> mi.Float:
-        """Density by which the phase function draws a direction at the point p of object k, 1/sr."""
+        """Density of the phase function for a direction at the point p of object k, 1/sr."""
         return channel_mean(eval_phase(self.media.coefficients(k, p, medium), cosine))
 
     def pdf_emitter(self, at: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool) -> mi.Float:
-        """Density by which `light` draws a direction to an emitter, 1/sr; 0 of emitters that are not sampled."""
+        """Density of `light` for a direction to an emitter, 1/sr; 0 of emitters that are not sampled."""
         # p_e = pdf / n of the emitters that are sampled
         active = active & (looked_up(self.tables["index"], ds.emitter, -1) >= 0)
         return dr.select(active, ds.emitter.pdf_direction(at, ds, active) / len(self.emitters), 0)

@@ -96,8 +96,8 @@ def group(help: str, cls: type[TyperGroup] | None = None, completion: bool = Fal
 def add(app: typer.Typer, name: str, function: Callable) -> None:
     """Add a command to a group.
 
-    A parameter of the function may be a record, a dataclass of values with typer annotations and defaults, each of
-    which is an option. Every command has the option --quiet beside its own.
+    A parameter of the function may be a record, a dataclass of values with typer annotations and defaults: each is
+    an option. Every command has the option --quiet beside its own.
     """
     parameters, records = [], {}
     for parameter in inspect.signature(function, eval_str=True).parameters.values():
@@ -172,7 +172,7 @@ def tell(sentence: str) -> None:
 def table(
     headings: Sequence[str], rows: Iterable[Sequence[str]], *, title: str = "", caption: str = "", left: int = 1
 ) -> Table:
-    """A table of texts, of which the first `left` columns are words and the others numbers."""
+    """A table of texts: the first `left` columns are words, the others numbers."""
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
     from rich.text import Text

@@ -41,7 +41,7 @@ def row_filter(text: str | None) -> Callable[[Truth], bool] | None:
 def summary(comparisons: list[Comparison]) -> list[JsonDict]:
     """One record per quantity: rows, largest and rms z, largest standard error relative to the traced value.
 
-    Reflectances of albedo below 0.5, of which larger relative errors are asked, are apart.
+    Reflectances of albedo below 0.5, whose bounds are wider, are apart.
     """
     groups: dict[str, list[Comparison]] = {}
     for c in comparisons:

@@ -41,7 +41,7 @@ COORDINATES, ATTRIBUTE = "checksums_of_coordinates", "checksum_of_halfspace_sss_
 
 
 def unit_checksum(S: np.ndarray, variance: np.ndarray) -> int:
-    """Of the data of a unit; never 0, which marks a unit not done."""
+    """Checksum of the data of a unit; never 0, which marks a unit not done."""
     data = np.ascontiguousarray(S, np.float32).tobytes(), np.ascontiguousarray(variance, np.float32).tobytes()
     return (1 << 32) | zlib.crc32(data[1], zlib.crc32(data[0]))
 

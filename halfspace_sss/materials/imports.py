@@ -47,7 +47,7 @@ def import_materials(path: str | os.PathLike, mm_per_unit: float | None = None) 
     """The materials of a MaterialX file (.mtlx) with OpenPBR surfaces, or of a glTF file (.glb, .gltf) that scatter.
 
     Args:
-        path: the file; surfaces without subsurface scattering are left out. Of the others one warning names what
+        path: the file; surfaces without subsurface scattering are left out. For the others one warning names what
             changes the picture and is no part of a medium, such as roughness, coats and partial weights.
         mm_per_unit: length of a unit of the file, by default 1 mm in MaterialX and a metre in glTF.
 

@@ -1,6 +1,6 @@
-"""The one way by which perceptrons are evaluated in Dr.Jit, inside of the kernel that asks.
+"""Perceptrons in Dr.Jit, evaluated inside of the kernel that asks.
 
-By cooperative vectors: in single precision on LLVM, in half precision on CUDA, which has no other. In double precision,
+As cooperative vectors: in single precision on LLVM, in half precision on CUDA, which has no other. In double precision,
 which these lack, layers are loops over outputs. So they are on CUDA where a network says so: OptiX takes 5 to 10 s for
 a product in the path tracer of a model that is large by itself. Loops are slower and have no derivatives; where these
 are asked for it is cooperative vectors.
@@ -43,7 +43,7 @@ def silu(x: Lanes) -> Lanes:
 class Perceptron:
     """x_1 = W_0 x_0 + b_0, x_{k+1} = W_k a(x_k) + b_k.
 
-    The first layer may be asked for in parts, W_0 = (U_0, U_1, ...), of which some are known before the others or
+    The first layer may be asked for in parts, W_0 = (U_0, U_1, ...), where some are known before the others or
     stand for several others:
 
         net.rest(net.activation(net.first(0, x, biased=True) + net.first(1, y)))
@@ -71,7 +71,7 @@ class Perceptron:
 
     @classmethod
     def named(cls, weights: Mapping[str, np.ndarray], matrix: str, bias: str, **more: object) -> Perceptron:
-        """That of the arrays `matrix`_k and `bias`_k, as many as there are."""
+        """The perceptron of the arrays `matrix`_k and `bias`_k, as many as there are."""
         n = sum(name.startswith(f"{matrix}_") for name in weights)
         return cls(*([weights[f"{name}_{k}"] for k in range(n)] for name in (matrix, bias)), **more)
 

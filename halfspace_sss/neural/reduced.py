@@ -6,7 +6,7 @@ query,
     ln factor(x; albedo) = phi_0(x) + Σ_k c_k(albedo) phi_k(x),    k = 1 ... 4,
 
 linear in the last hidden layers of the networks of two albedos. They are found by least squares over random queries, as
-those of each of many albedos first, of which the largest singular vectors are kept.
+those of each of many albedos first, whose largest singular vectors are kept.
 
 Measured over other random queries, weighted by r² sqrt(S_o S_i) of pairs of albedos, eta 1.4, in %:
 
@@ -16,7 +16,7 @@ Measured over other random queries, weighted by r² sqrt(S_o S_i) of pairs of al
     0.5, 0.3 to 0.999            0.8                 1.5              0.2
     0.8, 0.6 to 0.9999           1.4                 4.0              0.9
 
-By one network, of the middle, the mean is 1.3, 1.8 and, for g = 0.8, 5.9 %.
+With one network, of the middle, the mean is 1.3, 1.8 and, for g = 0.8, 5.9 %.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class ReducedNetworks:
 
     @classmethod
     def of(cls, models: Sequence[SymmetricModel]) -> ReducedNetworks:
-        """Of models of one g and eta, by albedo in an order in which they are smooth."""
+        """Reduce models of one g and eta, in an order of albedos in which they are smooth."""
         q = _queries(max(_length(m) for m in models), models[0].medium.eta)
         wanted = np.stack([_log_factor(m, q) for m in models])
         weights = _weights(models, q, wanted)

@@ -105,7 +105,7 @@ def C_1(n: float) -> float:
     """First Fresnel moment ∫ F(mu; 1/n) mu dmu; n = (medium the light is in) / (medium beyond).
 
     C_1(eta) is the internal (large) moment, C_1(1/eta) the external one; 2 C_1 is the diffuse
-    reflectance. By quadrature, to about 1e-12; exactly 0 at n = 1. Source: d'Eon and Irving 2011.
+    reflectance. Its quadrature has about 1e-12; exactly 0 at n = 1. Source: d'Eon and Irving 2011.
     """
     return _moment(float(n), 1)
 

@@ -161,7 +161,7 @@ class Medium:
     ) -> Medium:  # fmt: skip
         """The medium of the subsurface slab of OpenPBR 1.1, in linear Rec. 709.
 
-        By its definition the colour C is the share of the light which enters that leaves again, seen along the normal
+        The colour C is by definition the share of the light which enters that leaves again, seen along the normal
         under uniform light: R(mu = 1) = (1 - F_r(1)) C, with the smooth boundary and all orders. Here that is solved
         exactly, for any g and index. The van de Hulst fit that the standard shows is of a matched boundary: at index
         1.5 its medium of colour 0.5 is seen as 0.25. The mean free path is radius x scale, in units of `mm_per_unit`.

@@ -9,7 +9,7 @@ E and O the even and odd terms of sum_l beta_l P_l(mu) P_l(mu'), beta_l = (2 l +
 as e^(-k tau) has (A + B)(A - B) s = k² s and k d = (A - B) s. Inside, the boundary reflects by Fresnel. The forward
 peak is cut off by delta-M (Wiscombe 1977).
 
-That product is not symmetric, and near albedo 1 it loses 1 - a. Both factors are squares, though: with V = diag(W mu),
+The product is not symmetric, and near albedo 1 it loses 1 - a. Both factors are squares, though: with V = diag(W mu),
 A - B = V^-½ F F^T V^½ and A + B = V^-½ G G^T V^½. Then k are the singular values of G^T F = X diag(k) Y^T,
 s = V^-½ G X and d = V^-½ F Y: nothing is divided by k. What is the same in all directions is split off in F, where
 1 - a stands as it is given; on the nodes all other orders are made orthogonal to it.

@@ -38,7 +38,7 @@ class LayerTrace:
 
     Attributes:
         layers, mu_i, seed, backend: what was asked.
-        n_paths, n_events: walks traced; free paths, of which each ends in a scattering event or at an interface.
+        n_paths, n_events: walks traced; free paths, each of them up to a scattering event or at an interface.
         seconds: wall time, compilation included.
     """
 

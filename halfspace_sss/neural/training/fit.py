@@ -35,7 +35,7 @@ def cosine(rate: float, share: float, last: float = LAST_RATE) -> float:
 
 
 class Spent(NamedTuple):
-    """Steps of the optimiser, samples (cells seen, of which each shows two points), seconds and CPU seconds."""
+    """Steps of the optimiser, samples (cells seen, two points of each), seconds and CPU seconds."""
 
     steps: int
     samples: int
@@ -66,7 +66,7 @@ class Fit:
 
     Args:
         steps: of the optimiser, each on one batch.
-        n_groups, n_queries: groups of a batch, and cells of each group, of which two points are asked.
+        n_groups, n_queries: groups of a batch, and cells of each group, each asked at two points.
         rate: largest learning rate; it rises over the first 200 steps and falls by a cosine.
         checkpoint_every: seconds between checkpoints.
         validate_every: steps between two calls of the validation.

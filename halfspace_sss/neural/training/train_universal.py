@@ -1,6 +1,6 @@
 """Training of the network for all media: maps of many media, a fit, and a fit of `calibration` to exact reflectances.
 
-Of each medium, at some cosines of incidence, are known the exact R of order >= 2 (discrete ordinates less the exact
+For each medium, at some cosines of incidence, are known the exact R of order >= 2 (discrete ordinates less the exact
 single order) and the flux of the network towards 16 intervals of cosines of exit. The coefficients of a follow from the
 medium by a network whose loss is the squared logarithm of a(mu_i) sum_b flux_b a(mu_b) over R.
 """
@@ -60,7 +60,7 @@ CHUNK = 64  # media of a file
 
 
 class Fluxes(NamedTuple):
-    """Of n media: albedo, g, eta (n, 3); cosines of incidence (n, COSINES); of each the exact R of order >= 2, that of
+    """For n media: albedo, g, eta (n, 3); cosines of incidence (n, COSINES); of each the exact R of order >= 2, that of
     the network towards each interval (n, COSINES, INTERVALS), and the relative error of both together."""
 
     ratios: np.ndarray

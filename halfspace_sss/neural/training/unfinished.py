@@ -30,7 +30,7 @@ def claim(folder: Path, **run: object) -> None:
         run: all that the result follows from (medium, recipe, seed, ...), ready for JSON; the version is added.
 
     Raises:
-        ValueError: the folder holds the work of another run, or work of which nothing is known.
+        ValueError: the folder holds the work of another run, or work of an unknown one.
     """
     run = {"version": halfspace_sss.__version__, **run}
     place = folder / RUN
