@@ -43,6 +43,30 @@ def render(scene: dict, spp: int, seed: int = 1) -> np.ndarray:
     return np.array(mi.render(mi.load_dict(scene), spp=spp, seed=seed))
 
 
+LANES = 2**21  # of a launch; beyond, what it takes to trace a render in Python is small
+
+
+def independent(scene, n: int, spp: int, seed: int = 1, **film) -> np.ndarray:
+    """Independent images of the first sensor, shape (n, height, width, channels).
+
+    A batch of such sensors renders several in one launch: to trace a render in Python takes longer than few samples.
+    Walks precompute light for each launch, which images must not share: then each has its own.
+    """
+    import mitsuba as mi
+
+    sensor, integrator = scene.sensors()[0], scene.integrator()
+    width, height = sensor.film().size()
+    most = max(LANES // (width * height * spp), 1)
+    if hasattr(integrator, "precomputes") and integrator.precomputes(scene, integrator.tracer(scene).visitor.media):
+        most = 1
+    beside = max(k for k in range(1, n + 1) if n % k == 0 and k <= most)
+    film = {"type": "hdrfilm", "width": beside * width, "height": height, "rfilter": {"type": "box"},
+            "pixel_format": "rgb", "component_format": "float32", **film}  # fmt: skip
+    batch = mi.load_dict({"type": "batch", "film": film, **{f"view{k}": sensor for k in range(beside)}})
+    images = [np.array(mi.render(scene, sensor=batch, spp=spp, seed=seed + k), dtype=float) for k in range(n // beside)]
+    return np.concatenate([image.reshape(height, beside, width, -1).swapaxes(0, 1) for image in images])
+
+
 def mean_of_pixels(scene: dict, spp: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """Mean over the pixels and its standard error, per channel."""
     image = render(scene, spp, seed)

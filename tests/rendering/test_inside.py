@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rendered import independent
 
 mi = pytest.importorskip("mitsuba")
 
@@ -52,8 +53,7 @@ def _theirs(scene: dict, holders: dict[str, str]) -> Any:
 
 def _means(scene: Any, spp: int, seed: int, runs: int = RUNS) -> np.ndarray:
     """In float64: sums of what few pixels hold."""
-    return np.array([np.array(mi.render(scene, spp=spp, seed=seed + k), dtype=float).mean(axis=(0, 1))
-                     for k in range(runs)])  # fmt: skip
+    return independent(scene, runs, spp, seed).mean(axis=(1, 2))
 
 
 def _agree(found: np.ndarray, wanted: np.ndarray, known_to: float = LARGEST_ERROR) -> None:
@@ -183,13 +183,13 @@ def _unscattered(at: float, sigma_t: float, eta: float) -> float:
 
 
 def _all_around(nodes: np.ndarray, width: float) -> dict:
-    """Cameras by the cosine of their directions with z."""
-    sensors = {}
+    """Cameras by the cosine of their directions with z, whose images stand beside each other."""
+    film = {"type": "hdrfilm", "width": 4 * len(nodes), "height": 4, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    sensors = {"type": "batch", "film": film}
     for k, mu in enumerate(nodes):
         eye = [8 * np.sqrt(1 - mu * mu), 0, 8 * mu]
         view = mi.ScalarTransform4f().look_at(eye, [0, 0, 0], [0, 1, 0]).scale(0.5 * width)
-        film = {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
-        sensors[f"sensor{k}"] = {"type": "orthographic", "to_world": view, "film": film}
+        sensors[f"sensor{k}"] = {"type": "orthographic", "to_world": view}
     return sensors
 
 
@@ -199,11 +199,9 @@ def test_all_light_of_a_point_light_in_a_medium_without_absorption_leaves_it(kin
     nodes, weights = np.polynomial.legendre.leggauss(5)
     width = 2.2
     scene = _scene({**AROUND[kind](), **_lamp((0, 0, 0.5))}, {}, _wax(sigma_a=0.0, sigma_s=1.0))
-    del scene["sensor"]
-    loaded = mi.load_dict({**scene, **_all_around(nodes, width)})
-    seeds = [[(k, 10 * run + k) for k in range(len(nodes))] for run in range(RUNS)]
-    images = np.array([[np.array(mi.render(loaded, sensor=k, spp=2048, seed=seed), dtype=float).mean(axis=(0, 1))
-                        for k, seed in row] for row in seeds])  # fmt: skip
+    loaded = mi.load_dict({**scene, "sensor": _all_around(nodes, width)})
+    images = np.array([np.array(mi.render(loaded, spp=2048, seed=run), dtype=float) for run in range(RUNS)])
+    images = images.reshape(RUNS, 4, len(nodes), 4, 3).mean(axis=(1, 3))
     found = width**2 * np.einsum("k,rkc->rc", weights / 2, images)
     scattered = 1 - _unscattered(0.5, 1.0 * UNIT, MEDIUM["eta"])
     _agree(found, np.tile(scattered * np.array([3.0, 2.0, 1.0]), (RUNS, 1)))

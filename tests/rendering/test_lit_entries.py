@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rendered import independent
 
 import full_geometry
 from full_geometry.integrators import lit_entries
@@ -40,18 +41,13 @@ def _scene() -> Any:
     )
 
 
-def _images(scene: Any) -> np.ndarray:
-    """Independent images."""
-    return np.array([np.array(mi.render(scene, spp=256, seed=k), dtype=float) for k in range(SEEDS)])
-
-
 @pytest.mark.slow
 def test_entries_drawn_by_light_have_the_same_mean_and_less_noise(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lit_entries, "LEAST", 0)
     images = []
     for gain in (np.inf, 0.0):
         monkeypatch.setattr(lit_entries, "LEAST_GAIN", gain)
-        images.append(_images(_scene()))
+        images.append(independent(_scene(), SEEDS, 256))
     means = [part.mean(axis=(1, 2)) for part in images]
     error = np.sqrt(sum(m.var(axis=0, ddof=1) / SEEDS for m in means))
     assert (np.abs(means[0].mean(axis=0) - means[1].mean(axis=0)) < Z * error).all()

@@ -7,13 +7,13 @@ import warnings
 
 import numpy as np
 import pytest
-from rendered import MEDIUM, direction, surface
+from rendered import MEDIUM, direction, independent, surface
 from scipy import stats
 
 mi = pytest.importorskip("mitsuba")
 
 LAMP = {"type": "sphere", "center": [12, 3, 12], "radius": 2.0, "emitter": {"type": "area", "radiance": 10.0}}
-PASSES, SPP = 6, 112  # Student's t of 10 degrees of freedom; each render is traced in Python, which takes longest
+PASSES, SPP = 6, 112  # Student's t of 10 degrees of freedom
 LIGHTS = {"sky": {"type": "constant"}, "lamp": LAMP}
 
 
@@ -68,7 +68,7 @@ def image(shape: dict, light: str, bsdf: dict | None = None, integrator: str = "
     shape = {**shape, "bsdf": bsdf or {**surface(orders="total"), "reflection": True}}
     scene = mi.load_dict({"type": "scene", "integrator": {"type": integrator, "hide_emitters": True},
                           "light": LIGHTS[light], "object": shape, "sensor": sensor})  # fmt: skip
-    return np.array([np.array(mi.render(scene, spp=spp, seed=100 * seed + k)).mean(axis=2) for k in range(passes)])
+    return independent(scene, passes, spp, 100 * seed).mean(axis=3)
 
 
 def same(a: np.ndarray, b: np.ndarray) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rendered import independent
 
 mi = pytest.importorskip("mitsuba")
 from full_geometry.scenes.mitsuba_scene import with_media  # noqa: E402
@@ -49,8 +50,7 @@ def _scene(shape: dict[str, Any], lights: tuple[str, ...], surface: dict[str, An
 
 def _means(scene: Any, spp: int, seed: int) -> np.ndarray:
     """Of the left and the right half of the image, shape (runs, 2, 3)."""
-    images = [np.array(mi.render(scene, spp=spp, seed=seed + k), dtype=float) for k in range(RUNS)]
-    return np.array(images).reshape(RUNS, N, 2, N // 2, 3).mean(axis=(1, 3))
+    return independent(scene, RUNS, spp, seed).reshape(RUNS, N, 2, N // 2, 3).mean(axis=(1, 3))
 
 
 def _agree(found: np.ndarray, wanted: np.ndarray, known_to: float) -> None:

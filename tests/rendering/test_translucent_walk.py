@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rendered import independent
 
 from full_geometry.scenes.mitsuba_scene import with_media
 from halfspace_sss import Medium
@@ -47,7 +48,7 @@ def _cube() -> dict:
 
 
 def _runs(scene: Any, runs: int, spp: int, seed: int) -> np.ndarray:
-    return np.array([mi.render(scene, spp=spp, seed=seed + k) for k in range(runs)], dtype=float)
+    return independent(scene, runs, spp, seed)
 
 
 def _z(a: np.ndarray, b: np.ndarray | float) -> np.ndarray:
