@@ -223,26 +223,41 @@ def library(*args: Real) -> Library:
 
 def _common_float(lib: Library, args: tuple, names: Sequence[str] = ()) -> tuple:
     """Arguments as floating-point arrays of one library and the widest precision among the arrays."""
+    names = names or ("a query",) * len(args)
     if lib is _NUMPY:
-        arrays = [np.asarray(a) for a in args]
-        for name, array, raw in zip(names or ("a query",) * len(args), arrays, args):
+        arrays = [_converted(name, np.asarray, a) for name, a in zip(names, args)]
+        for name, array, raw in zip(names, arrays, args):
             if array.dtype.kind not in "biufO":  # objects are None, or numbers of another kind, such as fractions
                 raise ValueError(f"{name} must be real numbers, got {raw!r}")
         # Python numbers and integers are weak: they take the precision of the floating arrays around them
         strong = [a.dtype for a, raw in zip(arrays, args) if not isinstance(raw, (int, float)) and a.dtype.kind == "f"]
         dtype = np.result_type(np.float32, *strong) if strong else np.float64
-        return tuple(a.astype(dtype, copy=False) for a in arrays)
+        return tuple(_converted(n, functools.partial(np.asarray, dtype=dtype), a) for n, a in zip(names, arrays))
     if isinstance(lib, _TorchLibrary):
         torch = lib.torch
         tensors = [a for a in args if isinstance(a, torch.Tensor)]
+        for name, a in zip(names, args):
+            if isinstance(a, torch.Tensor) and a.is_complex():  # torch would leave out the imaginary part
+                raise ValueError(f"{name} must be real numbers, got {a!r}")
         floats = [a.dtype for a in tensors if a.dtype.is_floating_point] or [torch.get_default_dtype()]
         dtype = functools.reduce(torch.promote_types, floats)
-        return tuple(torch.as_tensor(a, dtype=dtype, device=tensors[0].device) for a in args)
+        convert = functools.partial(torch.as_tensor, dtype=dtype, device=tensors[0].device)
+        return tuple(_converted(name, convert, a) for name, a in zip(names, args))
     dr = lib.dr
     arrays = [a for a in args if dr.is_array_v(a)]
     total = functools.reduce(operator.add, (dr.zeros(type(a)) for a in arrays))  # of their common type
     kind = type(total) if dr.is_float_v(total) else dr.float32_array_t(type(total))
-    return tuple(kind(a) for a in args)
+    return tuple(_converted(name, kind, a) for name, a in zip(names, args))
+
+
+def _converted(name: str, convert: Callable[[object], Real], value: object) -> Real:
+    """An argument as a library makes it its own; ValueError where it cannot."""
+    try:
+        if isinstance(value, (str, bytes, dict)):  # Dr.Jit would take an empty one for no lanes
+            raise TypeError
+        return convert(value)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"{name} must be real numbers, got {value!r}") from error
 
 
 def broadcast_query(*args: Real, names: Sequence[str] = ()) -> tuple[Library, tuple]:
@@ -260,11 +275,12 @@ def broadcast_query(*args: Real, names: Sequence[str] = ()) -> tuple[Library, tu
     """
     lib = library(*args)
     args = _common_float(lib, args, names)
-    if lib is _NUMPY:
-        return lib, tuple(np.broadcast_arrays(*args))
-    if isinstance(lib, _TorchLibrary):
-        try:
-            return lib, tuple(lib.torch.broadcast_tensors(*args))
-        except RuntimeError as error:
-            raise ValueError(f"query shapes do not broadcast: {error}") from error
-    return lib, args
+    if isinstance(lib, _DrJitLibrary):
+        widths = [lib.dr.width(a) for a in args]
+        if len({*widths} - {0, 1}) > 1:
+            raise ValueError(f"query shapes do not broadcast: {widths} lanes")
+        return lib, args
+    try:
+        return lib, tuple(np.broadcast_arrays(*args) if lib is _NUMPY else lib.torch.broadcast_tensors(*args))
+    except (ValueError, RuntimeError) as error:
+        raise ValueError(f"query shapes do not broadcast: {error}") from error

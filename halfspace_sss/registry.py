@@ -66,7 +66,7 @@ def bssrdf(name: str, medium: Medium) -> BSSRDF:
 def model_class(name: str) -> type[BSSRDF]:
     """The class of a model; ValueError with the nearest name if there is none."""
     known = {**_installed(), **_registered}
-    if name not in known:
+    if not isinstance(name, str) or name not in known:
         hint = did_you_mean(name, list(known)) + "; `render` and `errors object` take models of objects"
         raise ValueError(f"model must be one of {', '.join(known)}, got {name!r}{hint}")
     return known[name]

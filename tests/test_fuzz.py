@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import fuzz
 import numpy as np
 import pytest
 from command_list import COMMANDS
@@ -201,3 +202,13 @@ def test_a_damaged_file_is_read_as_it_is_or_refused_in_a_sentence(kind: str, tmp
             raise AssertionError(f"{file.name}, kept as {saved}: {error!r}") from error
         finally:
             file.write_bytes(whole[file])
+
+
+@pytest.mark.parametrize(("door", "count"), [("eval", 40), ("materials", 80), ("scenes", 30)])
+def test_what_is_answered_at_a_front_door_is_within_bounds(door: str, count: int, tmp_path: Path) -> None:
+    fuzz.prepare()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        counts, wrong = fuzz.run(door, 0, CASES or count, tmp_path)
+    assert not wrong, wrong[0]
+    assert counts["answered"] > count / 5 and counts["refused"] > count / 10

@@ -120,8 +120,9 @@ def distances(angles: Angles, mu_i: float, q: Quadrature, powers: tuple[int, int
 
     A profile that falls as a power of r, so that the integrand never dies out, is cut a million times beyond its peak.
     """
-    mfp = np.atleast_1d(angles.medium.mfp)
-    low, high = math.log10(mfp.min()) + SCAN[0], math.log10(mfp.max()) + SCAN[1]
+    mfp, transport_mfp = np.atleast_1d(angles.medium.mfp), np.atleast_1d(1 / angles.medium.sigma_t_prime)
+    farthest = max(mfp.max(), 1e-6 * transport_mfp.max())  # the latter for g within 1e-6 of 1
+    low, high = math.log10(mfp.min()) + SCAN[0], math.log10(farthest) + SCAN[1]
     r = 10 ** np.linspace(low, high, 2 * math.ceil(high - low) + 1)
     M = np.abs(angles.exitance(r, mu_i)[0])
     alive = []

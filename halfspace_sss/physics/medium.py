@@ -15,6 +15,8 @@ import numpy as np
 from halfspace_sss.arrays import Real, library
 from halfspace_sss.physics.reflectance import DIFFUSE, albedo_of_reflectance, half_space_reflectance
 
+INDICES = (0.01, 100.0)  # relative: beyond, Fresnel's moments lose their digits
+EXTINCTIONS = (1e-18, 1e18)  # 1/mm: of float32 sigma_t² and its inverse are in range
 CLEAR = "a clear layer is sigma_s = 1e-9, g = 0"
 
 
@@ -29,11 +31,24 @@ def _number(name: str, value: object) -> np.ndarray:
         if value is None or isinstance(value, (str, bytes)):  # NumPy would make NaN of one, read the other
             raise TypeError
         array = np.array(value, dtype=np.float64) + 0.0  # no -0.0, whose hash is not that of 0.0
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{name} must be a number or a sequence of numbers, got {value!r}") from error
     if array.ndim > 1:
         raise ValueError(f"{name} must be a scalar or one value per channel, got shape {array.shape}")
     return np.asarray(array)
+
+
+def _index(name: str, value: object) -> float:
+    index = _number(name, value)
+    if index.ndim:
+        raise ValueError(f"{name} must be one number for all channels, got shape {index.shape}")
+    _check(name, index, *_between(index, INDICES))
+    return float(index)
+
+
+def _between(value: np.ndarray, bounds: tuple[float, float]) -> tuple[np.ndarray, str]:
+    """Where a value is within bounds, and the bounds in words."""
+    return (value >= bounds[0]) & (value <= bounds[1]), f"in [{bounds[0]:g}, {bounds[1]:g}]"
 
 
 def _common_shape(**fields: np.ndarray) -> tuple[int, ...]:
@@ -50,11 +65,11 @@ def check_ratios(albedo: np.ndarray, g: np.ndarray, eta: np.ndarray) -> None:
     """Check arrays of what a half-space in mean free paths is made of, by the ranges of `Medium`.
 
     Raises:
-        ValueError: an albedo is outside [0, 1], a g outside (-1, 1), an eta not finite or not > 0.
+        ValueError: an albedo is outside [0, 1], a g outside (-1, 1), an eta outside [0.01, 100].
     """
     _check("albedo", albedo, (albedo >= 0) & (albedo <= 1), "in [0, 1]")
     _check("g", g, np.abs(g) < 1, "in the open interval (-1, 1)")
-    _check("eta", eta, np.isfinite(eta) & (eta > 0), "finite and > 0")
+    _check("eta", eta, *_between(eta, INDICES))
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,14 +80,14 @@ class Medium:
         sigma_s: scattering coefficient, 1/mm, scalar or one value per channel, >= 0.
         sigma_a: absorption coefficient, 1/mm, scalar or one value per channel, >= 0.
         g: mean cosine of the Henyey-Greenstein phase function, in (-1, 1), scalar or per channel.
-        eta: relative index n_inside / n_outside, one number > 0.
+        eta: relative index n_inside / n_outside, one number in [0.01, 100].
 
     Everything else (`sigma_t`, `albedo`, `sigma_s_prime`, ...) derives from these four. Scalars stay
     scalars; if any coefficient has one value per channel, all have.
 
     Raises:
         ValueError: a coefficient is outside its range, not finite, has mismatched channels, or
-            sigma_s + sigma_a = 0 (a mean free path would be infinite).
+            sigma_s + sigma_a is outside [1e-18, 1e18], as 0 is (a mean free path would be infinite).
     """
 
     sigma_s: np.ndarray | float
@@ -82,10 +97,7 @@ class Medium:
 
     def __post_init__(self) -> None:
         fields = {name: _number(name, getattr(self, name)) for name in ("sigma_s", "sigma_a", "g")}
-        eta = _number("eta", self.eta)
-        if eta.ndim:
-            raise ValueError(f"eta must be one number for all channels, got shape {eta.shape}")
-        _check("eta", eta, np.isfinite(eta) & (eta > 0), "finite and > 0")
+        eta = _index("eta", self.eta)
         for name in ("sigma_s", "sigma_a"):
             value = fields[name]
             _check(name, value, np.isfinite(value) & (value >= 0), "finite and >= 0 (1/mm)")
@@ -99,12 +111,11 @@ class Medium:
             object.__setattr__(self, name, value.copy() if shape else float(value))
             if shape:
                 getattr(self, name).setflags(write=False)
-        object.__setattr__(self, "eta", float(eta))
+        object.__setattr__(self, "eta", eta)
         sigma_t = np.asarray(self.sigma_t)
-        with np.errstate(divide="ignore", over="ignore"):
-            ok = np.isfinite(sigma_t) & (sigma_t > 0) & np.isfinite(1 / sigma_t)
         hint = "" if np.any(sigma_t > 0) else f"; {CLEAR}"
-        _check("sigma_t = sigma_s + sigma_a", sigma_t, ok, "finite and > 0 (1/mm), and 1 / sigma_t finite", hint)
+        ok, bound = _between(sigma_t, EXTINCTIONS)
+        _check("sigma_t = sigma_s + sigma_a", sigma_t, ok, f"{bound} (1/mm)", hint)
 
     @classmethod
     def from_albedo(cls, albedo, sigma_t, g=0.0, eta=1.3) -> Medium:
@@ -146,12 +157,9 @@ class Medium:
         _check("mfp", mfp, np.isfinite(mfp) & (mfp > 0), "finite and > 0 (mm)")
         _check("g", g, np.abs(g) < 1, "in the open interval (-1, 1)")
         shape = _common_shape(reflectance=reflectance, mfp=mfp, g=g)
-        eta = _number("eta", eta)
-        if eta.ndim:
-            raise ValueError(f"eta must be one number for all channels, got shape {eta.shape}")
-        _check("eta", eta, np.isfinite(eta) & (eta > 0), "finite and > 0")
+        eta = _index("eta", eta)
         pairs = np.broadcast(reflectance, np.broadcast_to(g, shape))
-        albedo = np.array([float(albedo_of_reflectance(R, float(k), float(eta), mu_i)) for R, k in pairs])
+        albedo = np.array([float(albedo_of_reflectance(R, float(k), eta, mu_i)) for R, k in pairs])
         return cls.from_albedo(albedo.reshape(pairs.shape), 1 / mfp, g, eta)
 
     @classmethod
@@ -177,10 +185,8 @@ class Medium:
             )
         )  # fmt: skip
         _check("subsurface_color", color, (color >= 0) & (color <= 1), "in [0, 1]")
-        eta = _number("specular_ior", specular_ior)
-        _check("specular_ior", eta, np.isfinite(eta) & (eta > 0), "finite and > 0")
         _common_shape(subsurface_radius=radius, subsurface_radius_scale=scale, subsurface_color=color)
-        enters = half_space_reflectance(1.0, 0.0, float(eta), 1.0)  # 1 - F_r(1), as the inverse has it
+        enters = half_space_reflectance(1.0, 0.0, _index("specular_ior", specular_ior), 1.0)  # 1 - F_r(1)
         g = subsurface_scatter_anisotropy
         return cls.from_reflectance(enters * color, radius * scale * unit, g, specular_ior, mu_i=1.0)
 

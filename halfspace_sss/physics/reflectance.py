@@ -85,7 +85,7 @@ def _reflectance(albedo: float, g: float, eta: float, mu_i: float | str) -> floa
     else:  # reciprocity: what comes out towards mu_i then is R(mu_i)
         entered = F_t(mu_i, eta)
         R = entered * _upwards(m, basis, share, mu_internal(mu_i, eta)) / eta**2
-    return float(np.clip(R, 0, entered))  # but for rounding
+    return float(np.clip(R, 0, min(entered, 1.0)))  # but for rounding
 
 
 def _even_light(albedo: float, g: float, eta: float) -> tuple[_Modes, _Basis, np.ndarray, np.ndarray]:

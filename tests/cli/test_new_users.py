@@ -143,12 +143,25 @@ def test_a_mesh_without_faces_is_refused_in_a_sentence(integrator: str, tmp_path
         mi.render(scene, spp=1)
 
 
-@pytest.mark.parametrize("value", [1j, "1", np.array([1 + 0j]), ["a"], np.array("2026", "datetime64[Y]")])
+@pytest.mark.parametrize("value", [1j, "1", np.array([1 + 0j]), ["a"], np.array("2026", "datetime64[Y]"), {}, 10**400])
 @pytest.mark.parametrize("argument", ["r", "mu_i", "phi_o"])
 def test_a_query_of_what_is_no_real_number_is_refused_by_name(argument: str, value: object) -> None:
     query = {"r": 1.0, "mu_i": 1.0, "phi_i": 0.0, "mu_o": 1.0, "phi_o": 0.0, argument: value}
     with pytest.raises(ValueError, match=f"^{argument} must be real numbers, got"):
         sss.bssrdf("better_dipole", MEDIUM).eval(**query)
+
+
+@pytest.mark.parametrize("value", [1j, "1", {}, 10**400])
+def test_so_it_is_beside_tensors(value: object) -> None:
+    torch = pytest.importorskip("torch")
+    model, value = sss.bssrdf("better_dipole", MEDIUM), torch.tensor(value) if isinstance(value, complex) else value
+    with pytest.raises(ValueError, match="^mu_i must be real numbers, got"):
+        model.eval(torch.ones(2), value, 0.0, 1.0, 0.0)
+
+
+def test_a_model_is_named_by_a_text() -> None:
+    with pytest.raises(ValueError, match=r"^model must be one of .*, got \[\]"):
+        sss.bssrdf([], MEDIUM)
 
 
 SPECTRA = "wavelength,mu_a,mu_s,g,n\n{},0.1,1,0.8,1.4\n{},0.2,2,0.8,1.4\n"

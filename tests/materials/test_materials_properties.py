@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import tempfile
 from pathlib import Path
 
@@ -30,7 +29,7 @@ def test_a_file_is_read_as_it_was_written(name: str, sigma_s: float, sigma_a: fl
     text = 'set = "mine"\nunit = "1/mm"\nsource = "measured"\n'
     text += f'[[material]]\nname = "{name}"\nsigma_s = {sigma_s!r}\nsigma_a = {sigma_a!r}\n'
     text += f"g = {g!r}\neta = {eta!r}\n"
-    if sigma_s + sigma_a == 0 or not math.isfinite(1 / (sigma_s + sigma_a)):
+    if sigma_s + sigma_a < 1e-18:
         with pytest.raises(ValueError, match="wax.toml"):
             _read(text)
         return

@@ -254,3 +254,10 @@ def test_positions_of_a_denser_medium_raise_the_variance_of_the_weight(name):
     model.sample_position = other.sample_position
     assert 0 < own < 10
     assert measure.weight_variance(model) > 2 * own
+
+
+def test_light_that_is_hardly_turned_is_found_however_far_it_goes():
+    """g within 1e-6 of 1: the flux leaves 1e9 mean free paths away and more."""
+    media = (Medium(1.0, 0.0, 1 - e) for e in (1e-5, 1e-12))
+    R = [measure.reflectance(bssrdf("better_dipole", medium), 0.5) for medium in media]
+    np.testing.assert_allclose(R[1], R[0], rtol=2e-5)

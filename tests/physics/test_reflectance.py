@@ -135,7 +135,7 @@ def test_the_walk_gives_the_wanted_reflectance():
         (dict(reflectance=0.5, mfp=0.0), "mfp must be finite and > 0"),
         (dict(reflectance=0.5, mfp=1.0, g=1.0), "g must be in the open interval"),
         (dict(reflectance=0.5, mfp=1.0, g=-0.99999), "g must be in \\[-0.9999, 0.9999\\] for the exact .*got -0.99999"),
-        (dict(reflectance=0.5, mfp=1.0, eta=0.0), "eta must be finite and > 0"),
+        (dict(reflectance=0.5, mfp=1.0, eta=0.0), r"eta must be in \[0.01, 100\]"),
         (dict(reflectance=0.5, mfp=1.0, mu_i=1.5), "mu_i must be a number in"),
         (dict(reflectance=[0.5, 0.4], mfp=[1.0, 2.0, 3.0]), "same number of channels"),
     ],
@@ -149,3 +149,7 @@ def test_a_g_beyond_what_the_nodes_resolve_is_refused_by_name():
     for g in (-1 + 1e-9, 0.99995):
         with pytest.raises(ValueError, match=r"g must be in \[-0.9999, 0.9999\] for the exact reflectance, got"):
             Medium.from_albedo(0.9, 1.0, g, 1.4).reflectance()
+
+
+def test_rounding_makes_no_reflectance_above_1():
+    assert Medium(1.28e-4, 0.0, 0.9, 1.0000000000000129).reflectance() <= 1
