@@ -53,7 +53,7 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Whole suites keep their kernels apart: they are compiled without LLVM's optional passes."""
-    if config.option.markexpr in ("not slow", "slow"):
+    if config.option.markexpr in ("", "not slow", "slow"):
         QUICKLY.mkdir(parents=True, exist_ok=True)
         os.environ.setdefault("DRJIT_CACHE_DIR", str(QUICKLY))
 

@@ -143,12 +143,14 @@ def test_cells_by_area_are_drawn_as_often_as_their_area_says(pool: MapPool) -> N
     assert float((pool.batch(64, 4096, torch.Generator().manual_seed(0)).r < high / 2).float().mean()) > 0.6
 
 
+@pytest.mark.slow
 def test_at_equal_data_every_variant_sees_the_same_samples(table: pandas.DataFrame) -> None:
     found = table[table["budget"] == "383 samples"]
     assert list(found["variant"]) == [v.name for v in VARIANTS]
     assert set(found["samples"]) == {3 * BATCH} and set(found["steps"]) == {3}
 
 
+@pytest.mark.slow
 def test_at_equal_time_every_variant_trains_until_the_time_is_spent(table: pandas.DataFrame) -> None:
     found = table[table["budget"] == "0.05 s"]
     assert list(found["variant"]) == [v.name for v in VARIANTS]
@@ -163,6 +165,7 @@ def test_at_equal_data_a_seed_repeats_in_an_executor_and_another_one_differs(rep
     assert (first["error"] != other["error"]).all()
 
 
+@pytest.mark.slow
 def test_the_summary_is_of_each_budget_and_variant_over_the_seeds(
     table: pandas.DataFrame, repeated: pandas.DataFrame
 ) -> None:  # fmt: skip

@@ -14,6 +14,8 @@ import halfspace_sss
 from benchmarks import __main__ as cli
 from benchmarks import bench_command as cli_bench
 
+pytestmark = pytest.mark.slow
+
 
 def _invoke(*arguments: str) -> Any:
     return CliRunner().invoke(cli.app, ["bench", *arguments])
