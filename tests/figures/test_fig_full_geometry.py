@@ -56,6 +56,8 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(fig01.SPP, "draft", {"path_traced": 16, "model": 4})
     monkeypatch.setitem(fig06.SPP, "draft", {"path_traced": 16, MODEL: 4})
     monkeypatch.setattr(fig06, "MATERIAL", "ketchup")
+    for name, value in (("EXITS", 16), ("WALKS", 128), ("SAMPLES", 64)):
+        monkeypatch.setattr(training, name, value)
     monkeypatch.setitem(fig07.RIVALS_SPP, "draft", dict.fromkeys(fig07.RIVALS_SPP["draft"], 16))
     monkeypatch.setitem(fig07.SECONDS, "draft", 0.01)
     monkeypatch.setattr(distant_light, "DIRECTIONS", 12)

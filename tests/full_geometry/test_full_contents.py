@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rendered import independent
 
 dr = pytest.importorskip("drjit")
 mi = pytest.importorskip("mitsuba")
@@ -91,7 +92,7 @@ def seen(loaded: mi.Scene, spp: int) -> SurfacePoint:
 
 
 def images(loaded: mi.Scene, spp: int, runs: int = RUNS) -> np.ndarray:
-    return np.array([np.array(mi.render(loaded, spp=spp, seed=k), dtype=float).mean(axis=(0, 1)) for k in range(runs)])
+    return independent(loaded, runs, spp).mean(axis=(1, 2))
 
 
 def agree(found: np.ndarray, wanted: np.ndarray, known_to: float) -> None:

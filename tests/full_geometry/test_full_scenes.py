@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from coarse import coarse_ball
+from rendered import independent
 
 from halfspace_sss import Medium
 
@@ -47,7 +48,7 @@ pytestmark = pytest.mark.usefixtures("rgb")
 
 BUNNY = Path(__file__).parents[2] / "figures" / "assets" / "bunny.ply"
 QUICK = Recipe(width=32, depth=2, batch=1024, chunk=2**15, reuse=4)
-CHUNKS, PASSES = 10, 6
+CHUNKS, PASSES = 6, 6
 COLOURS = {"sigma_s": "0.95,0.8,0.6", "sigma_a": "0.05,0.2,0.4", "eta": 1.4}
 WAX = Medium(np.array([0.95, 0.8, 0.6]), np.array([0.05, 0.2, 0.4]), 0.0, 1.4)
 SURFACE = {"type": "translucent", **COLOURS, "model": "full_geometry", "orders": "multiple", "reflection": False}
@@ -88,8 +89,7 @@ def scene(objects: dict, model: str, **integrator) -> dict:
 def halves(objects: dict, model: str, spp: int = 128) -> np.ndarray:
     """Mean of the left and of the right half of the picture in every pass, (passes, 2, channels)."""
     loaded = load_scene(scene(objects, model), model)
-    images = np.array([np.array(mi.render(loaded, spp=spp, seed=k)) for k in range(PASSES)])
-    return images.reshape(PASSES, 16, 2, 12, -1)[..., :3].mean(axis=(1, 3))
+    return independent(loaded, PASSES, spp).reshape(PASSES, 16, 2, 12, -1)[..., :3].mean(axis=(1, 3))
 
 
 def agree(objects: dict, trained: Trained, spp: int = 32) -> None:
@@ -379,7 +379,7 @@ def test_an_even_sky_has_the_same_light_and_a_fifth_of_the_variance(trained: Tra
         if not knows:
             for body in scene.integrator().prepare(scene):
                 object.__setattr__(body, "transport", _WithoutAlbedo(body.transport))
-        runs = np.array([np.array(mi.render(scene, spp=32, seed=k)) for k in range(8)])
+        runs = independent(scene, 8, 32)
         means.append(runs.mean(axis=(0, 1, 2)))
         variances.append(runs.var(axis=0, ddof=1).mean())
     error = np.sqrt(sum(variances) / 8) / 16

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rendered import independent
 
 dr = pytest.importorskip("drjit")
 mi = pytest.importorskip("mitsuba")
@@ -159,8 +160,7 @@ def halves(shown: dict, model: str, mm_per_unit: float, spp: int = 128) -> np.nd
         "sensor": {"type": "perspective", "fov": 28.0, "to_world": at, "film": film},
     }  # fmt: skip
     loaded = load_scene(scene, model)
-    images = np.array([np.array(mi.render(loaded, spp=spp, seed=k)) for k in range(PASSES)])
-    return images.reshape(PASSES, 16, 2, 12, -1)[..., :3].mean(axis=(1, 3))
+    return independent(loaded, PASSES, spp).reshape(PASSES, 16, 2, 12, -1)[..., :3].mean(axis=(1, 3))
 
 
 def agree(shown: dict, trained: Trained, mm_per_unit: float = 1.0) -> None:

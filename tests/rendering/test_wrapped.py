@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 import pytest
-from rendered import direction, surface
+from rendered import direction, independent, surface
 from scipy import stats
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -15,7 +15,7 @@ mi = pytest.importorskip("mitsuba")
 
 LAMP = {"type": "sphere", "center": [12, 3, 12], "radius": 3.0, "emitter": {"type": "area", "radiance": 10.0}}
 BALL = {"type": "sphere", "radius": 4.0}
-PASSES, SPP = 5, 96  # Student's t of 8 degrees of freedom; each render is traced in Python, which takes longest
+PASSES, SPP = 5, 96  # Student's t of 8 degrees of freedom
 PLAIN = {**surface("better_dipole", "total"), "reflection": True}
 RED = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.1, 0.1]}}
 INTEGRATORS = ["bssrdf", "translucent_walk"]
@@ -36,7 +36,7 @@ def images(bsdf: dict | None, integrator: str, seed: int = 1, shape: dict = BALL
              "sensor": {"type": "perspective", "fov": 18.0, "to_world": at, "film": film},
              **({"object": {**shape, "bsdf": bsdf}} if bsdf else {})}  # fmt: skip
     scene = mi.load_dict(scene)
-    return np.array([np.array(mi.render(scene, spp=SPP, seed=100 * seed + k)) for k in range(PASSES)])
+    return independent(scene, PASSES, SPP, 100 * seed)
 
 
 def same(a: np.ndarray, b: np.ndarray) -> None:
