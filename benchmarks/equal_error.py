@@ -21,7 +21,6 @@ from figures.computing.contenders import (
     ready,
     volume,
 )
-from figures.computing.images import cover
 from figures.computing.learnt import (
     CHUNKS,
     FULL_GEOMETRY,
@@ -39,6 +38,7 @@ from figures.computing.timed import TimedRender, alternating, rendered
 from figures.fig01 import VIEWS
 from figures.modelling.objects import TISSUES, VARYING, tissue
 from figures.parts.part import Params, Part, Result, SceneDict, Task
+from full_geometry.trade.denoising import cover
 from halfspace_sss import materials
 from halfspace_sss.checks import check_choice
 from halfspace_sss.physics.medium import Medium

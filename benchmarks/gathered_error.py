@@ -12,11 +12,11 @@ import pandas
 
 from benchmarks.speeds import LitObject, scene_of, train
 from figures.computing.contenders import WALK
-from figures.computing.images import cover
 from figures.computing.scans import prepare
 from figures.computing.timed import rendered
 from figures.parts.part import Row
 from full_geometry.integrators.gathering import Gathering
+from full_geometry.trade.denoising import cover
 from halfspace_sss.neural.store import weights_in
 
 if TYPE_CHECKING:

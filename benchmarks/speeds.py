@@ -20,7 +20,6 @@ import pandas
 
 from benchmarks.hand_and_ribbon import SHAPES
 from figures.computing.contenders import WALK, ready, volume
-from figures.computing.images import cover
 from figures.computing.learnt import object_parts
 from figures.computing.scans import SCANS, prepare, scan_scene, surroundings
 from figures.computing.timed import TimedRender, alternating, rendered
@@ -28,6 +27,7 @@ from figures.fig01 import VIEWS
 from figures.modelling.objects import VARYING, tissue
 from figures.parts.part import Row, SceneDict
 from full_geometry.learning.meshes import surface
+from full_geometry.trade.denoising import cover
 from halfspace_sss import materials
 from halfspace_sss.neural.store import weights_in
 from halfspace_sss.physics.medium import Medium

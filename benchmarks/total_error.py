@@ -25,10 +25,12 @@ import pandas
 
 from benchmarks.speeds import VOLUMES, LitObject
 from figures.computing.contenders import ready
-from figures.computing.images import cover, denoised, guides
 from figures.computing.scans import prepare
 from figures.parts.part import Row
+from full_geometry.scenes.cross_denoising import cross_denoised
+from full_geometry.scenes.reference_store import Reference
 from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
+from full_geometry.trade.denoising import Denoiser, cover
 
 SAMPLED, PRECOMPUTED = "walk, light sampled", "walk, light precomputed"
 MODEL, CORRECTED = "better_dipole", "better_dipole, light corrected"
@@ -82,19 +84,19 @@ def _scene(case: LitObject, way: str, size: int, folder: Path) -> mi.Scene:
 def _measured(case: LitObject, how: TotalErrors, folder: Path) -> list[Row]:
     scenes = {way: _scene(case, way, how.size, folder) for way in PASSING}
     inside = cover(scenes[SAMPLED]) > 0
-    about = guides(scenes[SAMPLED])
+    denoise = Denoiser(scenes[SAMPLED])
     reference = _passes(scenes[SAMPLED], how.reference, REFERENCE_SPP, how.seed + 1)[0][..., :3]
     R, noise = reference.mean(axis=0), reference.var(axis=0, ddof=1) / len(reference)
 
     # ---- images of every way after each time: means of passes, and corrected light from its beginning
-    found: dict[tuple[str, float], tuple[np.ndarray, int]] = {}
+    found: dict[tuple[str, float], Reference] = {}
     costs = {}
     for way, scene in scenes.items():
         spp = _samples(scene, how.seconds[0] / SHARE, how.seed)
         images, seconds = _passes(scene, how.seconds[-1], spp, how.seed + 1000)
         for limit in how.seconds:
             n = int(np.clip(np.searchsorted(np.cumsum(seconds), limit, side="right"), 1, len(seconds)))
-            found[way, limit] = images[:n].mean(axis=0), n * spp
+            found[way, limit] = _averaged(images[:n], spp)
         costs[way] = _cost(images[..., :3], seconds, inside)
     for limit in how.seconds:
         found[CORRECTED, limit] = _corrected(lambda: _scene(case, CORRECTED, how.size, folder), limit, how.seed)
@@ -102,14 +104,16 @@ def _measured(case: LitObject, how: TotalErrors, folder: Path) -> list[Row]:
 
     # ---- a row for each, raw and denoised
     rows = []
-    for (way, limit), (image, spp) in found.items():
-        for name, result in (("raw", image[..., :3]), ("denoised", _clean(image, about))):
+    for (way, limit), average in found.items():
+        clean = cross_denoised(average, denoise)
+        raw = average.mean[..., :3], average.relative_error
+        for name, (result, told) in (("raw", raw), ("denoised", (clean.image, clean.error))):
             pixels, blocks = (_error(result, R, noise, inside, size) for size in (1, BLOCK))
             mean = result[inside].mean(axis=0) / R[inside].mean(axis=0)
             rows.append(
                 {
                     "object": case.name, "light": case.light, "way": f"{way}, {name}", "seconds": limit,
-                    "spp": spp, "pixels, %": 100 * pixels, "blocks, %": 100 * blocks,
+                    "spp": average.spp, "pixels, %": 100 * pixels, "blocks, %": 100 * blocks, "told, %": 100 * told,
                     "mean R": mean[0], "mean G": mean[1], "mean B": mean[2],
                     "variance x time": best / costs[way] if name == "raw" and way in costs else np.nan,
                 }
@@ -117,7 +121,15 @@ def _measured(case: LitObject, how: TotalErrors, folder: Path) -> list[Row]:
     return rows
 
 
-def _corrected(fresh: Callable[[], mi.Scene], limit: float, seed: int) -> tuple[np.ndarray, int]:
+def _averaged(images: np.ndarray, spp: int) -> Reference:
+    """The mean of passes, with that of half of them."""
+    result = Reference.empty(images.shape[1:], {}, halves=True)
+    for image in images:
+        result = result.add(image, spp, 0.0)
+    return result
+
+
+def _corrected(fresh: Callable[[], mi.Scene], limit: float, seed: int) -> Reference:
     """The image of most samples, a power of two, whose light and pixels take so many CPU seconds from a fresh scene."""
     spp, best = 1, None
     mi.render(fresh(), spp=1, seed=seed)  # compiles
@@ -127,7 +139,7 @@ def _corrected(fresh: Callable[[], mi.Scene], limit: float, seed: int) -> tuple[
         if time.process_time() - started > limit and best is not None:
             break
         best, spp = (image, spp), 2 * spp
-    return best
+    return _averaged(best[0][None], best[1])
 
 
 def _samples(scene: mi.Scene, seconds: float, seed: int) -> int:
@@ -156,13 +168,6 @@ def _passes(scene: mi.Scene, seconds: float, spp: int, seed: int) -> tuple[np.nd
 def _cost(images: np.ndarray, seconds: list[float], inside: np.ndarray) -> float:
     """Variance of a pass times its seconds, summed over the pixels of the object."""
     return float(images[:, inside].var(axis=0, ddof=1).sum() * np.mean(seconds))
-
-
-def _clean(image: np.ndarray, about: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Denoised; of what has a layer of emission all but that."""
-    light = np.maximum(image[..., :3], 0)
-    emission = np.clip(image[..., 3:], 0, light) if image.shape[2] > 3 else np.zeros_like(light)
-    return denoised((light - emission).astype(np.float32), *about)[0] + emission
 
 
 def _error(image: np.ndarray, R: np.ndarray, noise: np.ndarray, inside: np.ndarray, size: int) -> float:

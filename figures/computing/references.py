@@ -7,19 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from figures.computing.contenders import WALK, contender
-from figures.computing.images import (
-    FLIP,
-    Shot,
-    check_denoiser,
-    compared,
-    cover,
-    denoised,
-    guides,
-    noise_of,
-    stops_of,
-)
+from figures.computing.images import FLIP, Shot, compared, noise_of, stops_of
 from figures.computing.scans import long_render, prepare
 from figures.parts.part import Result, Task
+from full_geometry.trade.denoising import check_denoiser, cover, denoised, guides
 
 if TYPE_CHECKING:
     import mitsuba as mi

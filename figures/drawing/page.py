@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib import colormaps  # without it there is no page, which must be known before one is drawn
 
-from figures.computing.images import FLIP, RELATIVE_MSE, Shot, compared, denoised, guides
+from figures.computing.images import FLIP, RELATIVE_MSE, Shot, compared
 from full_geometry.trade.image_differences import srgb
 from halfspace_sss.provenance import JsonDict
 
@@ -160,19 +160,11 @@ def _address(pixels: np.ndarray, kind: str, **settings: bool | int) -> str:
 
 
 def render(picture: Picture) -> dict[str, bytes]:
-    """{"html": page}, and with `denoise` {"denoised.exr", "denoised.png"}; on the page both images can be flipped.
-
-    Raises:
-        ValueError: the image is not finite or below 0.
-        BackendError: the denoiser is not installed.
-    """
-    image = np.maximum(picture.image, 0.0)  # filters with negative lobes
-    shots, files = [Shot("rendered", image, dict(picture.numbers))], {}
-    if picture.denoise:
-        emission = np.zeros_like(image) if picture.emission is None else np.minimum(picture.emission, image)
-        clean, seconds = denoised(image - emission, *guides(picture.scene, sensor=picture.sensor))
-        clean = clean + emission  # edges of lamps in the mirror stay sharp
-        shots.append(Shot("denoised", clean, {"denoising, s": f"{seconds:.2g}"}))
+    """{"html": page}, and with a denoised image {"denoised.exr", "denoised.png"}; on the page both can be flipped."""
+    shots, files = [Shot("rendered", np.maximum(picture.image, 0.0), dict(picture.numbers))], {}
+    if picture.clean is not None:
+        clean, numbers = picture.clean
+        shots.append(Shot("denoised", clean, dict(numbers)))
         files = {"denoised.exr": picture.exr(clean), "denoised.png": picture.png(clean)}
     text = page(picture.title, {picture.title: shots}, caption=picture.caption, lower_is_better=())
     return {"html": text.encode(), **files}

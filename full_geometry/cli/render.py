@@ -88,7 +88,9 @@ class ImageOptions:
 
     seed: shared.Seed = 0
     sensor: Annotated[str, typer.Option(help="Number of the sensor, several as 0,1, or all.")] = "0"
-    denoise: Annotated[bool, typer.Option("--denoise", help="Also write a denoised image.")] = False
+    denoise: Annotated[
+        bool, typer.Option("--denoise", help="Also write a denoised image; --target-error then is its error.")
+    ] = False
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with the unfinished or finished render of the same settings.")
     ] = False
@@ -111,8 +113,10 @@ def render(
     """
     use_mitsuba(variant)
     from full_geometry.integrators.bssrdf import is_bssrdf
+    from full_geometry.scenes.cross_denoising import cross_denoised
     from full_geometry.scenes.reference import chosen
     from full_geometry.scenes.reference_store import Picture
+    from full_geometry.trade.denoising import Denoiser
     from halfspace_sss.locks import one_writer
     from halfspace_sss.provenance import check_folder
 
@@ -131,15 +135,14 @@ def render(
         file = out / f"{'_'.join(filter(None, name))}.exr"
         with one_writer(file):
             which = {"seed": images.seed, "sensor": k, **transport.training()}
-            result = _rendered(loaded, file, limits, which, images.resume)
-            emission = result.mean[..., -3:] if getattr(loaded.integrator(), "layers", False) else None
+            denoise = Denoiser(loaded, k) if images.denoise else None
+            result = _rendered(loaded, file, limits, {**which, "denoise": denoise}, images.resume)
+            clean = cross_denoised(result, denoise) if denoise else None
             told, error = _numbers(result), _error(result, limits.target_error or SMALL_ERROR)
-            picture = Picture(
-                title=file.stem, image=_colours(result.mean), numbers=told, caption=error, scene=loaded, sensor=k,
-                denoise=images.denoise, emission=emission,
-            )  # fmt: skip
-            files = _publish(picture, file, drawers)
+            off = (clean.image, {"error": clean.told}) if clean else None
+            files = _publish(Picture(file.stem, _colours(result.mean), told, error, off), file, drawers)
             shared.say(f"{result.spp} samples a pixel in {result.seconds:.1f} s; {error}")
+            shared.say(*([clean.told] if clean else []))
             shared.say_files(files)
             if is_bssrdf(loaded.integrator()):
                 shared.say(*_off(loaded, result.mean, k, transport.model))
@@ -269,7 +272,7 @@ class _Bars:
         if self.title != "rendering":
             self._begin("rendering")
         self.so_far = reference.spp
-        error = f", error {reference.relative_error:.2%}" if math.isfinite(reference.relative_error) else ""
+        error = f", error {reference.error:.2%}" if math.isfinite(reference.error) else ""
         self.bar.show(round(1000 * self.limits.share(reference)), 1000, f"{reference.spp} spp{error}")
 
 

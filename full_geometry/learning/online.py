@@ -25,6 +25,7 @@ from full_geometry.learning.learners import LearntObject, learner, learners
 from full_geometry.objects.objects import outermost, translucent_shapes
 from full_geometry.scenes import reference
 from full_geometry.scenes.camera_walks import CameraWalks
+from full_geometry.scenes.cross_denoising import Denoise
 from full_geometry.scenes.reference_store import BY_CHANCE, Reference, load, save
 from full_geometry.surface.wrapped import surface_of, wrapping_of
 from halfspace_sss.checks import check_count, check_interval
@@ -82,6 +83,7 @@ def render(
     seed: int = 0,
     resume: bool | str | os.PathLike = True,
     listeners: Listeners = Listeners(),  # noqa: B008
+    denoise: Denoise | None = None,
     **limits: Any,
 ) -> Reference:
     """`reference.render`, before which objects without weights are learnt from walks that join the image.
@@ -99,6 +101,7 @@ def render(
         seed: of walks, learning and render.
         resume: True goes on with what is at `path`, False begins anew, another path goes on with what is there.
         listeners: what is called on the way.
+        denoise: as of `reference.render`; of an image with walks in it no halves are kept.
         limits: fields of `reference.Limits`.
 
     Returns:
@@ -121,7 +124,7 @@ def render(
     elif base != path:
         _fetch(files(base), parts)
     names = untrained(scene) if train_seconds > 0 else {}
-    how = {"sensor": sensor, "seed": seed, "progress": listeners.rendered, **limits}
+    how = {"sensor": sensor, "seed": seed, "progress": listeners.rendered, "denoise": denoise, **limits}
     if not names and not parts["walks.exr"].exists():
         if is_bssrdf(integrator):
             integrator.prepare(scene)  # here, because Mitsuba wraps what is refused while it renders
@@ -140,7 +143,7 @@ def render(
         result = replace(result, about={**result.about, TRAINING: records})
     else:
         model = reference.render(scene, parts["model.exr"], **how)
-        result = combined(walks.found, model)
+        result = combined(walks.found, model).without_halves()
         result = replace(result, about={**result.about, TRAINING: walks.found.about.get(TRAINING, [])})
     save(path, result)
     shutil.rmtree(parts["training"], ignore_errors=True)

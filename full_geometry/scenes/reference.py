@@ -23,7 +23,8 @@ from full_geometry.geometry.sensors import seeded
 from full_geometry.geometry.snapshot import children, scene_hash, words
 from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.objects.objects import translucent_shapes
-from full_geometry.scenes.reference_store import BY_CHANCE, CHANNELS, Reference, finite_pixels, load, save
+from full_geometry.scenes.cross_denoising import Denoise, cross_denoised
+from full_geometry.scenes.reference_store import BY_CHANCE, CHANNELS, DENOISED, Reference, finite_pixels, load, save
 from full_geometry.scenes.scene_files import first_cause
 from full_geometry.settings import AUTO, check_variant
 from full_geometry.surface.wrapped import surface_of
@@ -34,6 +35,7 @@ from halfspace_sss.provenance import check_folder, provenance
 FEWEST_PASSES = 8  # before the spread of the passes is trusted to stop a run
 SHARE = 4  # a growing pass has at most a quarter of the samples so far: enough passes for their spread, few launches
 MOST_PIXELS = 2**26  # 8192 x 8192: the numbers of the pixels alone take some 10 GB
+DENOISED_AGAIN = 1.5  # times the samples, from which on the error of a denoised image is computed anew
 LARGEST_PASS = 64  # samples per pixel: an interrupt waits for one pass
 Progress = Callable[[Reference], None]
 
@@ -47,6 +49,7 @@ def render(
     seed: int = 0,
     resume: bool | str | os.PathLike = True,
     progress: Progress | None = None,
+    denoise: Denoise | None = None,
     **limits: float | None,
 ) -> Reference:
     """Render a scene in passes into an EXR file, or go on with the file that is there.
@@ -63,6 +66,8 @@ def render(
         resume: True goes on with the file at `path` if there is one, False begins anew, another path goes on with the
             file there and leaves it as it is.
         progress: called after each pass.
+        denoise: a denoiser, by which the halves of the samples are kept and `target_error` is the error of the denoised
+            image, see `cross_denoising`.
         limits: fields of `Limits`, one of `spp`, `passes`, `target_error` and `seconds` at least.
 
     Raises:
@@ -80,20 +85,27 @@ def render(
     with one_writer(path):
         about = about_render(scene, integrator, sensor, seed) | chosen(scene, integrator)
         about["learnt"] = learnt(scene, integrator)
-        return _in_passes(scene, integrator, path, about, until, resume, progress)
+        return _in_passes(scene, integrator, path, about, until, resume, progress, denoise)
 
 
 def _in_passes(
     scene: mi.Scene, integrator: mi.Integrator, path: Path, about: dict[str, Any], limits: Limits,
-    resume: bool | str | os.PathLike, progress: Progress | None,
+    resume: bool | str | os.PathLike, progress: Progress | None, denoise: Denoise | None,
 ) -> Reference:  # fmt: skip
     """Take passes until a limit is reached, and write the file now and then and at the end."""
     result = _start(path, resume, about)
+    if denoise is not None and result is not None and result.half is None:
+        raise ValueError(f"{path} must hold the halves of a denoised render to go on with it, got none; delete it")
+    if denoise is None and result is not None:
+        result = result.without_halves()
     written = result if resume is True else None
     last = time.monotonic()
     try:
         while not limits.reached(result):
-            result = _pass(result, scene, integrator, about, limits.next_spp(result))
+            start = result or Reference.empty((), about, denoise is not None)
+            result = _pass(start, scene, integrator, limits.next_spp(result))
+            if denoise is not None and limits.target_error is not None:
+                result = _with_error(result, denoise)
             if time.monotonic() - last >= limits.interval:
                 _keep(path, result)
                 written, last = result, time.monotonic()
@@ -103,6 +115,16 @@ def _in_passes(
         if result is not None and result is not written:
             _keep(path, result)
     return result
+
+
+def _with_error(found: Reference, denoise: Denoise) -> Reference:
+    """A render that knows the error of its denoised image, of now or of when it had most of its samples."""
+    known = found.about.get(DENOISED)
+    if found.passes < 2 or (known and found.spp < DENOISED_AGAIN * known["spp"]):
+        return found
+    _, error, standard_error = cross_denoised(found, denoise)
+    known = {"spp": found.spp, "error": error, "standard_error": standard_error}
+    return replace(found, about={**found.about, DENOISED: known})
 
 
 def _keep(path: Path, reference: Reference) -> None:
@@ -121,7 +143,7 @@ class Limits:
     Args:
         spp: samples per pixel in all.
         passes: number of passes in all.
-        target_error: `Reference.relative_error` to come down to; looked at from the 8th pass on.
+        target_error: `Reference.error` to come down to; looked at from the 8th pass on.
         seconds: of rendering in all.
         spp_per_pass: samples per pixel of a pass; by default passes grow with what is there, from 1 to 64. The last
             one is cut to `spp`.
@@ -160,7 +182,7 @@ class Limits:
             return False
         trusted = reference.passes >= FEWEST_PASSES
         pairs = ((self.spp, reference.spp), (self.passes, reference.passes), (self.seconds, reference.seconds))
-        certain = self.target_error is not None and trusted and reference.relative_error <= self.target_error
+        certain = self.target_error is not None and trusted and reference.error <= self.target_error
         return certain or any(limit is not None and value >= limit for limit, value in pairs)
 
     def share(self, reference: Reference) -> float:
@@ -168,22 +190,20 @@ class Limits:
         pairs = ((reference.spp, self.spp), (reference.passes, self.passes), (reference.seconds, self.seconds))
         shares = [value / limit for value, limit in pairs if limit is not None]
         if self.target_error is not None and reference.passes > 1:
-            error = reference.relative_error
+            error = reference.error
             shares.append((self.target_error / error) ** 2 if error > self.target_error else 1.0)
         return min(max(shares, default=0.0), 1.0)
 
 
-def _pass(
-    reference: Reference | None, scene: mi.Scene, integrator: mi.Integrator, about: dict[str, Any], spp: int
-) -> Reference:
-    number, sensor = reference.passes if reference else 0, about["sensor"]
-    started = time.perf_counter()
-    seed = seeded(about["seed"], number)
+def _pass(start: Reference, scene: mi.Scene, integrator: mi.Integrator, spp: int) -> Reference:
+    about, number = start.about, start.passes
+    started, sensor, seed = time.perf_counter(), about["sensor"], seeded(about["seed"], number)
     image = mi.render(scene, sensor=sensor, integrator=integrator, seed=seed, spp=spp)
     image = finite_pixels(f"pass {number}", image)
-    if reference is None and (names := channel_names(scene.sensors()[sensor].film(), integrator, image.shape[2])):
-        about = {**about, CHANNELS: names}
-    start = reference or Reference.empty(image.shape, about)
+    if not number:
+        names = channel_names(scene.sensors()[sensor].film(), integrator, image.shape[2])
+        about = {**about, CHANNELS: names} if names else about
+        start = Reference.empty(image.shape, about, start.half is not None)
     result = start.add(image, spp, time.perf_counter() - started)
     if not is_bssrdf(integrator) or mi.is_spectral:
         return result

@@ -2,7 +2,8 @@
 picture.
 
 Each quantity q is two float32 channels, q and q.rest, whose sum holds 48 bits: the state after a pass is rounded to
-that, so that a run that is read back goes on with the same numbers as one that was never interrupted.
+that, so that a run that is read back goes on with the same numbers as one that was never interrupted. The mean of half
+of the passes, by which a denoiser is held to the other half, is in the file where it was asked for.
 """
 
 from __future__ import annotations
@@ -21,9 +22,10 @@ import numpy as np
 
 from halfspace_sss.provenance import write_together
 
-FORMAT = "halfspace-sss reference 2"
+FORMAT = "halfspace-sss reference 3"
 HEADER = "halfspace_sss"
 CHANNELS = "channels"  # their names
+DENOISED = "denoised"  # error of the denoised image, its standard error, and the samples that it is of
 BY_CHANCE = "squares_by_chance"  # of light that orders below two met by chance, summed over samples
 
 
@@ -38,6 +40,8 @@ class Reference:
         spp: samples per pixel of all passes together.
         seconds: time spent on them.
         about: what was rendered: scene (hash), integrator, seed, and provenance.
+        half: mean of the passes of one half, float64, shape of `mean`; None where no half is kept.
+        half_spp: their samples per pixel.
     """
 
     mean: np.ndarray
@@ -46,11 +50,18 @@ class Reference:
     spp: int
     seconds: float
     about: dict[str, Any] = field(default_factory=dict)
+    half: np.ndarray | None = None
+    half_spp: int = 0
 
     @classmethod
-    def empty(cls, shape: tuple[int, ...], about: dict[str, Any]) -> Reference:
-        """Before the first pass."""
-        return cls(np.zeros(shape), np.zeros(shape), 0, 0, 0.0, about)
+    def empty(cls, shape: tuple[int, ...], about: dict[str, Any], halves: bool = False) -> Reference:
+        """Before the first pass; with `halves` the mean of half of the passes is kept."""
+        return cls(np.zeros(shape), np.zeros(shape), 0, 0, 0.0, about, np.zeros(shape) if halves else None)
+
+    def without_halves(self) -> Reference:
+        """As it would be if no half had been kept."""
+        about = {name: value for name, value in self.about.items() if name != DENOISED}
+        return replace(self, about=about, half=None, half_spp=0)
 
     @property
     def standard_error(self) -> np.ndarray:
@@ -71,6 +82,17 @@ class Reference:
         return float(np.sqrt(self.variance[..., :3][lit].sum() / np.sum(self.mean[..., :3][lit] ** 2)))
 
     @property
+    def error(self) -> float:
+        """`relative_error`, or with halves the most that the denoised image is off: its error and one standard error.
+
+        Infinite before that is known.
+        """
+        if self.half is None:
+            return self.relative_error
+        known = self.about.get(DENOISED)
+        return known["error"] + known["standard_error"] if known else math.inf
+
+    @property
     def share_by_chance(self) -> float | None:
         """Most of the variance that is light which orders below two meet by chance; None where it is not known.
 
@@ -86,15 +108,20 @@ class Reference:
         """The average with one more pass of spp samples per pixel, rounded to what a file keeps.
 
         Passes count by their samples n_k: mean m = sum n_k x_k / N, variance of the mean
-        sum n_k (x_k - m)² / ((K - 1) N), updated as by West (1979).
+        sum n_k (x_k - m)² / ((K - 1) N), updated as by West (1979). A pass joins the half of fewer samples.
         """
         n, passes = self.spp + spp, self.passes + 1
         delta = image.astype(np.float64) - self.mean
         mean = self.mean + delta * (spp / n)
         squares = self.variance * self.spp * (self.passes - 1) + spp * delta * (image - mean)
         variance = squares / (n * (passes - 1)) if passes > 1 else np.zeros_like(mean)
-        mean, variance = sum(_halves(mean)), sum(_halves(variance))
-        return replace(self, mean=mean, variance=variance, passes=passes, spp=n, seconds=self.seconds + seconds)
+        half, half_spp = self.half, self.half_spp
+        if half is not None and 2 * half_spp <= self.spp:
+            half_spp += spp
+            half = sum(_two_floats(half + (image - half) * (spp / half_spp)))
+        mean, variance = sum(_two_floats(mean)), sum(_two_floats(variance))
+        seconds += self.seconds
+        return Reference(mean, variance, passes, n, seconds, self.about, half, half_spp)
 
 
 def finite_pixels(name: str, image: mi.TensorXf) -> np.ndarray:
@@ -107,7 +134,7 @@ def finite_pixels(name: str, image: mi.TensorXf) -> np.ndarray:
     return pixels
 
 
-def _halves(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _two_floats(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A float64 array as the sum of two whose values are float32."""
     high = values.astype(np.float32).astype(np.float64)
     return high, (values - high).astype(np.float32).astype(np.float64)
@@ -116,31 +143,34 @@ def _halves(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _names(channels: int, about: dict[str, Any]) -> list[str]:
     """Names of channels: those in `about` if all their parts differ, else colours or numbers."""
     given, known = about.get(CHANNELS, []), {1: ["Y"], 3: ["R", "G", "B"], 4: ["R", "G", "B", "A"]}
-    if len(given) == channels and len(set(_of_parts(given))) == 4 * channels:
+    if len(given) == channels and len(set(_of_parts(given, True))) == 6 * channels:
         return given
     return known.get(channels) or [f"channel{k}" for k in range(channels)]
 
 
-def _of_parts(names: list[str]) -> list[str]:
-    parts = ("{}", "variance.{}", "rest.{}", "variance.rest.{}")
-    return [part.format(name) for part in parts for name in names]
+def _of_parts(names: list[str], halves: bool) -> list[str]:
+    parts = ("{}", "variance.{}", "rest.{}", "variance.rest.{}", "half.{}", "half.rest.{}")
+    return [part.format(name) for part in parts[: 6 if halves else 4] for name in names]
 
 
 def save(path: Path, reference: Reference) -> None:
     """Write the EXR, whole or not at all, and beside it the JSON of its header for people to read, never of another."""
-    (mean, mean_rest), (variance, variance_rest) = _halves(reference.mean), _halves(reference.variance)
-    pixels = np.ascontiguousarray(np.concatenate([mean, variance, mean_rest, variance_rest], axis=2), dtype=np.float32)
+    (mean, mean_rest), (variance, variance_rest) = _two_floats(reference.mean), _two_floats(reference.variance)
+    halves = [] if reference.half is None else _two_floats(reference.half)
+    parts = [mean, variance, mean_rest, variance_rest, *halves]
+    pixels = np.ascontiguousarray(np.concatenate(parts, axis=2), dtype=np.float32)
     header = {
         "format": FORMAT,
         "passes": reference.passes,
         "spp": reference.spp,
         "seconds": reference.seconds,
+        **({"half_spp": reference.half_spp} if halves else {}),
         "relative_error": reference.relative_error if math.isfinite(reference.relative_error) else None,
         "share_by_chance": reference.share_by_chance,
         "pixels": hashlib.sha256(pixels.tobytes()).hexdigest(),
         **reference.about,
     }
-    names = _of_parts(_names(reference.mean.shape[2], reference.about))
+    names = _of_parts(_names(reference.mean.shape[2], reference.about), bool(halves))
     bitmap = mi.Bitmap(pixels, mi.Bitmap.PixelFormat.MultiChannel, channel_names=names)
     text = json.dumps(header, indent=1)
     bitmap.metadata()[HEADER] = text
@@ -163,8 +193,9 @@ def load(path: str | os.PathLike) -> Reference:
     except (RuntimeError, KeyError, json.JSONDecodeError) as error:
         raise ValueError(f"{name} must be an EXR file written by reference.render: {error}") from error
     names = [channel.name for channel in bitmap.struct_()]
-    channels = len(names) // 4
-    wanted = _of_parts(_names(channels, header)) if isinstance(header, dict) else []
+    halves = isinstance(header, dict) and "half_spp" in header
+    parts = 6 if halves else 4
+    wanted = _of_parts(_names(len(names) // parts, header), halves) if isinstance(header, dict) else []
     if not isinstance(header, dict) or header.get("format") != FORMAT or sorted(names) != sorted(wanted):
         raise ValueError(f"{name} must have the format {FORMAT!r}, got channels {names}")
     pixels = np.ascontiguousarray(pixels[..., [names.index(key) for key in wanted]])
@@ -172,12 +203,14 @@ def load(path: str | os.PathLike) -> Reference:
         raise ValueError(f"{name} is damaged: its pixels are not those that were written")
     try:
         passes, spp, seconds = int(header.pop("passes")), int(header.pop("spp")), float(header.pop("seconds"))
+        half_spp = int(header.pop("half_spp", 0))
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{name} must tell passes, spp and seconds: {error!r}") from error
     for key in ("format", "relative_error", "share_by_chance"):
         header.pop(key, None)
-    mean, variance, mean_rest, variance_rest = np.split(pixels.astype(np.float64), 4, axis=2)
-    return Reference(mean + mean_rest, variance + variance_rest, passes, spp, seconds, header)
+    mean, variance, mean_rest, variance_rest, *half = np.split(pixels.astype(np.float64), parts, axis=2)
+    half = sum(half) if halves else None
+    return Reference(mean + mean_rest, variance + variance_rest, passes, spp, seconds, header, half, half_spp)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -193,20 +226,14 @@ class Picture:
         image: linear radiance (H, W, 3).
         numbers: name -> what is known of it.
         caption: a sentence.
-        scene, sensor: Mitsuba scene and number of the sensor, to render guides for a denoiser.
-        denoise: whether an image without noise is asked for.
-        emission: its part that has no noise to take out (H, W, 3): emitters that the camera sees, at once or in the
-            mirror of an object; None where that is not known.
+        clean: the denoised image (H, W, 3), and numbers of it; None if there is none.
     """
 
     title: str
     image: np.ndarray
     numbers: Mapping[str, str]
     caption: str
-    scene: mi.Scene
-    sensor: int
-    denoise: bool
-    emission: np.ndarray | None = None
+    clean: tuple[np.ndarray, Mapping[str, str]] | None = None
 
     def png(self, image: np.ndarray | None = None) -> bytes:
         """The image as a display shows it."""

@@ -1,0 +1,108 @@
+"""Images without their noise, by Open Image Denoise, and what leads it: albedo and normals."""
+
+from __future__ import annotations
+
+import time
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from full_geometry.trade.image_differences import check_image
+from halfspace_sss.backend import BackendError
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+GUIDE_SPP = 64
+GUIDES = "albedo:albedo,n:sh_normal"  # of the integrator `aov`
+
+
+def check_denoiser() -> ModuleType:
+    """The package `mitsuba_oidn`; BackendError with what to install where there is none."""
+    try:
+        import mitsuba_oidn
+    except ImportError as error:
+        raise BackendError('denoising needs mitsuba-oidn: pip install "halfspace-sss[figures]"') from error
+    return mitsuba_oidn
+
+
+def cover(scene: mi.Scene, spp: int = GUIDE_SPP) -> np.ndarray:
+    """Share of each pixel that objects cover, (H, W), float32."""
+    return _cover(_aovs(scene, "n:sh_normal", spp, 0))
+
+
+def guides(scene: mi.Scene, sensor: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Mean albedo of each pixel (H, W, 3) and mean shading normal (H, W, 3), both float32.
+
+    The albedo of translucent objects is their directional albedo. Where there is none at all, as of mirrors and glass,
+    it is the cover of the pixel, as Open Image Denoise asks.
+    """
+    return guides_of(_aovs(scene, GUIDES, GUIDE_SPP, sensor))
+
+
+def guides_of(aovs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same from an image of `GUIDES`."""
+    albedo, normal = np.clip(aovs[..., :3], 0, 1), aovs[..., 3:6]
+    return np.where(albedo.any(axis=2, keepdims=True), albedo, _cover(normal)[..., None]), np.clip(normal, -1, 1)
+
+
+def _aovs(scene: mi.Scene, aovs: str, spp: int, sensor: int) -> np.ndarray:
+    import mitsuba as mi
+
+    integrator = mi.load_dict({"type": "aov", "aovs": aovs})
+    return np.array(mi.render(scene, integrator=integrator, sensor=sensor, spp=spp, seed=7), dtype=np.float32)
+
+
+def _cover(normal: np.ndarray) -> np.ndarray:
+    return np.clip(np.linalg.norm(normal[..., :3], axis=2), 0, 1)
+
+
+def denoised(image: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, float]:
+    """The image without its noise, float32, and the seconds it took.
+
+    Args:
+        image: linear radiance (H, W, 3).
+        albedo, normal: as `guides` makes them.
+
+    Raises:
+        ValueError: the image is not finite or below 0, or the sizes differ.
+        BackendError: the denoiser is not installed.
+    """
+    oidn, pixels = check_denoiser(), check_image("image", image)
+    for name, guide in (("albedo", albedo), ("normal", normal)):
+        if np.shape(guide) != pixels.shape:
+            raise ValueError(f"{name} must have the shape of the image {pixels.shape}, got {np.shape(guide)}")
+    albedo, normal = (np.ascontiguousarray(guide, dtype=np.float32) for guide in (albedo, normal))
+    started = time.perf_counter()
+    result = oidn.denoise(pixels, albedo=albedo, normal=normal, hdr=True)
+    return np.maximum(np.asarray(result), 0.0), time.perf_counter() - started
+
+
+class Denoiser:
+    """A denoiser of renders of a scene, led by its albedo and normals.
+
+    Args:
+        scene: of Mitsuba.
+        sensor: number of the sensor.
+
+    Raises:
+        BackendError: the denoiser is not installed.
+    """
+
+    def __init__(self, scene: mi.Scene, sensor: int = 0) -> None:
+        check_denoiser()
+        self._guides = guides(scene, sensor)
+        self._layered = bool(getattr(scene.integrator(), "layers", False))
+
+    def __call__(self, image: np.ndarray) -> np.ndarray:
+        """The colours (H, W, 3) without noise; a layer of emission stays as it is: edges of lamps in mirrors are sharp.
+
+        Args:
+            image: linear radiance (H, W, channels), the last three the emission if the integrator has
+                that layer and there are more than three.
+        """
+        # filters with negative lobes go below 0
+        light = np.maximum(image[..., :3] if image.shape[2] >= 3 else image[..., :1].repeat(3, axis=2), 0.0)
+        emission = np.clip(image[..., -3:], 0.0, light) if self._layered and image.shape[2] > 3 else 0.0
+        return denoised((light - emission).astype(np.float32), *self._guides)[0] + emission
