@@ -29,9 +29,10 @@ tank_ml (the published dilution), note, and a table [sources] that tells for eac
 from halfspace_sss.materials.catalogue import load, names, register, table
 from halfspace_sss.materials.material import Material
 from halfspace_sss.materials.spectra import RGBMedium, SpectralMedium, read_spectra
+from halfspace_sss.materials.spheres import SphereSample, from_spheres
 from halfspace_sss.materials.tissues import Skin, Tissue, published_tissue, skin, tissue
 
 __all__ = [
-    "Material", "RGBMedium", "Skin", "SpectralMedium", "Tissue", "load", "names", "published_tissue", "read_spectra",
-    "register", "skin", "table", "tissue",
+    "Material", "RGBMedium", "Skin", "SpectralMedium", "SphereSample", "Tissue", "from_spheres", "load", "names",
+    "published_tissue", "read_spectra", "register", "skin", "table", "tissue",
 ]  # fmt: skip

@@ -98,11 +98,84 @@ def _even_light(albedo: float, g: float, eta: float) -> tuple[_Modes, _Basis, np
 
 def _upwards(m: _Modes, basis: _Basis, share: np.ndarray, inside: float) -> float:
     """Radiance that arrives at the boundary from within at the cosine `inside`."""
+    return _sources(m, basis, inside)[0] / (m.k * inside + 1) @ share
+
+
+def _sources(m: _Modes, basis: _Basis, inside: float) -> tuple[np.ndarray, np.ndarray]:
+    """What each mode scatters upwards and downwards at the cosine `inside`, per optical thickness, at depth 0."""
     P = np.polynomial.legendre.legvander(np.array([inside]), len(m.a_beta) - 1)[0] * m.a_beta
     root = np.sqrt(basis.w)
     even = P[0] * basis.w + ((P[2::2] - basis.mean * m.a_beta[2::2]) @ basis.even.T) * root
     odd = (P[1::2] @ basis.odd.T) * root
-    return (even @ m.s - odd @ m.d) / (2 * (m.k * inside + 1)) @ share
+    s, d = even @ m.s, odd @ m.d
+    return (s - d) / 2, (s + d) / 2
+
+
+class SlabFluxes(NamedTuple):
+    """Of a slab between slides, per incident flux, all reflections included: of light along the normal, and diffuse."""
+
+    reflectance: float
+    transmittance: float
+    unscattered: float  # part of the transmittance
+    diffuse_reflectance: float
+
+
+LARGEST_SLAB_ALBEDO = 1 - 1e-9  # beyond it light that decays from both sides cannot be told apart
+
+
+def slab_fluxes(
+    albedo: float, g: float, tau: float, eta: float, eta_slide: float = 1.0, nodes: int = NODES
+) -> SlabFluxes:
+    """Reflectance and transmittance of a slab in air, with or without slides of glass on both sides.
+
+    Radiance is sum_j a_j s_j exp(-k_j t) + b_j s_j exp(-k_j (tau - t)); by the symmetry of the slab a + b and a - b are
+    solved for apart. What is asked of one direction is integrated along it.
+
+    Args:
+        albedo, g: of single scattering, as in `half_space_reflectance`; albedos beyond 1 - 1e-9 count as that.
+        tau: optical thickness, > 0.
+        eta, eta_slide: index of the medium, >= 1, and of slides that do not absorb, 1 for none; light adds up
+            incoherently.
+        nodes: quadrature points.
+    """
+    with one_blas_thread():
+        return _slab_fluxes(min(albedo, LARGEST_SLAB_ALBEDO), g, tau, eta, eta_slide, nodes)
+
+
+def _slab_fluxes(albedo: float, g: float, tau: float, eta: float, eta_slide: float, nodes: int) -> SlabFluxes:
+    m, basis = _modes(albedo, g, eta, nodes), _basis(eta, nodes)
+    thick = tau * (1 - albedo * g**nodes)  # of delta-M
+    F = _slide_reflectance(basis.mu, eta, eta_slide)
+    down, up, far = (m.s + m.d) / 2, (m.s - m.d) / 2, np.exp(-m.k * thick)
+    lit, dark = down - F[:, None] * up, (up - F[:, None] * down) * far
+    entering = (1 - F) * eta**2
+    both, odd = np.linalg.solve(lit + dark, entering), np.linalg.solve(lit - dark, entering)
+    a, b = (both + odd) / 2, (both - odd) / 2
+    diffuse = 2 * np.sum(basis.w * basis.mu * (1 - F) * (up @ a + down @ (far * b) - eta**2)) + 1
+    # along the normal: what modes scatter on the way through, I⁻(0) = E F I⁺(tau) + SU, I⁺(tau) = E (F I⁻(0) + T) + SD
+    u, v = _sources(m, basis, 1.0)
+    E, near = math.exp(-thick), -np.expm1(-(m.k + 1) * thick) / (m.k + 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        across = np.where(abs(m.k - 1) < 1e-7, thick * E, (far - E) / (1 - m.k))
+    SU, SD = a @ (u * near) + b @ (v * across), a @ (v * across) + b @ (u * near)
+    F = float(_slide_reflectance(np.ones(1), eta, eta_slide)[0])
+    T = (1 - F) * eta**2
+    upwards = (E * F * (E * T + SD) + SU) / (1 - (E * F) ** 2)
+    downwards = E * (F * upwards + T) + SD
+    straight = math.exp(-tau)
+    return SlabFluxes(
+        reflectance=F + (1 - F) * upwards / eta**2, transmittance=(1 - F) * downwards / eta**2,
+        unscattered=(1 - F) ** 2 * straight / (1 - (F * straight) ** 2), diffuse_reflectance=float(diffuse),
+    )  # fmt: skip
+
+
+def _slide_reflectance(mu: np.ndarray, eta: float, eta_slide: float) -> np.ndarray:
+    """Of a boundary with a slide, for light from within the medium at the cosines mu."""
+    inner = F_r(mu, eta_slide / eta)
+    sine2 = np.minimum((1 - mu * mu) * (eta / eta_slide) ** 2, 1.0)
+    outer = F_r(np.sqrt(1 - sine2), 1 / eta_slide)
+    turned = inner >= 1
+    return np.where(turned, 1.0, inner + (1 - inner) ** 2 * outer / np.where(turned, 1.0, 1 - inner * outer))
 
 
 def directional_table(g: float, eta: float, x: np.ndarray, mu_in: np.ndarray) -> np.ndarray:
@@ -128,8 +201,8 @@ def _check(g: float, mu_i: float | str) -> None:
         raise ValueError(f"mu_i must be a number in [0, 1] or {DIFFUSE!r}, got {mu_i!r}")
 
 
-def _modes(albedo: float, g: float, eta: float) -> _Modes:
-    basis = _basis(eta)
+def _modes(albedo: float, g: float, eta: float, nodes: int = NODES) -> _Modes:
+    basis = _basis(eta, nodes)
     n = len(basis.mu)
     # delta-M: the share g^n of the peak counts as unscattered
     peak = g**n
@@ -148,8 +221,8 @@ def _modes(albedo: float, g: float, eta: float) -> _Modes:
 
 
 @functools.lru_cache(maxsize=16)
-def _basis(eta: float) -> _Basis:
-    mu, w = _nodes(NODES, eta)
+def _basis(eta: float, nodes: int = NODES) -> _Basis:
+    mu, w = _nodes(nodes, eta)
     P = np.polynomial.legendre.legvander(mu, len(mu) - 1)
     root, mean = np.sqrt(w)[:, None], w @ P[:, 2::2]
     turn = np.linalg.qr(np.column_stack([root, np.eye(len(mu))[:, 1:]]))[0]
