@@ -14,8 +14,14 @@ from halfspace_sss.measure.consistency import (
 )
 from halfspace_sss.measure.quadrature import Quadrature
 from halfspace_sss.measure.reflected_flux import Integral, Moments, moments, profile, reflectance, reflectance_estimate
+from halfspace_sss.measure.spatial_frequency import (
+    ReducedCoefficients,
+    coefficients_of_frequencies,
+    frequency_reflectance,
+)
 
 __all__ = [
-    "Integral", "Moments", "Quadrature", "ReciprocityGap", "clamped_energy", "energy_table", "moments", "profile",
-    "reciprocity_gap", "reflectance", "reflectance_estimate", "weight_variance",
+    "Integral", "Moments", "Quadrature", "ReciprocityGap", "ReducedCoefficients", "clamped_energy",
+    "coefficients_of_frequencies", "energy_table", "frequency_reflectance", "moments", "profile", "reciprocity_gap",
+    "reflectance", "reflectance_estimate", "weight_variance",
 ]  # fmt: skip

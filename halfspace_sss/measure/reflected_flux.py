@@ -80,7 +80,7 @@ def reflectance(
     Raises:
         ValueError: mu_i is out of range, or the model cannot form the order.
     """
-    _check_order(model, order)
+    check_order(model, order)
     angles = Angles(model.eval, model.medium, quadrature or DEFAULT)
     on_lattice = quadrature is None and angles.both_azimuths
     R = _lattice(model, mu_i).value if on_lattice else over_incidence(angles, mu_i, quadrature or DEFAULT)
@@ -92,7 +92,7 @@ def reflectance_estimate(model: BSSRDF, mu_i: Incidence = 1.0, order: str | None
 
     Arguments, shapes and errors as `reflectance`.
     """
-    _check_order(model, order)
+    check_order(model, order)
     angles = Angles(model.eval, model.medium, DEFAULT)
     if angles.both_azimuths:
         R = _lattice(model, mu_i)
@@ -103,7 +103,8 @@ def reflectance_estimate(model: BSSRDF, mu_i: Incidence = 1.0, order: str | None
     return Integral(R.value + _single(model, mu_i, order), R.error)
 
 
-def _check_order(model: BSSRDF, order: str | None) -> None:
+def check_order(model: BSSRDF, order: str | None) -> None:
+    """ValueError unless the model can form the order, None or "total"."""
     if order not in (None, model.orders) and (order, model.orders) != ("total", "multiple"):
         raise ValueError(
             f'order must be {model.orders!r} or None for {model.name!r}, or "total" if "multiple", got {order!r}'

@@ -324,17 +324,17 @@ class Readings:
 
     def reflectance_at(self, sigma_a: float | Sequence[float]) -> Estimate:
         """The reflectance if the medium absorbed sigma_a (1/mm), not less than it does, of the shape of sigma_a."""
-        return estimate(self._white(sigma_a).sum(axis=1).reshape(-1, *np.shape(sigma_a)))
+        return estimate(self.at_absorptions(sigma_a).sum(axis=1).reshape(-1, *np.shape(sigma_a)))
 
     def exitance_at(self, sigma_a: float | Sequence[float]) -> Estimate:
         """R(r) over each of `radii` if the medium absorbed sigma_a, 1/mm², shape (rings, *sigma_a)."""
         self._rings("white")
-        found = self._white(sigma_a)[:, :-1] / self._areas()[:, None]
+        found = self.at_absorptions(sigma_a)[:, :-1] / self._areas()[:, None]
         return estimate(found.reshape(*found.shape[:2], *np.shape(sigma_a)))
 
     def frequency_at(self, frequencies: Sequence[float], sigma_a: float | Sequence[float]) -> Estimate:
         """R(f) if the medium absorbed sigma_a, shape (frequencies, *sigma_a)."""
-        found = transformed(self._white(sigma_a), self.radii, frequencies)
+        found = transformed(self.at_absorptions(sigma_a), self.radii, frequencies)
         return estimate(found.reshape(*found.shape[:2], *np.shape(sigma_a)))
 
     def fluence(self) -> Estimate:
@@ -372,9 +372,13 @@ class Readings:
     def _areas(self) -> np.ndarray:
         return np.pi * np.diff(self.radii**2)
 
-    def _white(self, sigma_a: float | Sequence[float]) -> np.ndarray:
+    def histogram(self) -> np.ndarray:
+        """Flux by place and path length, shape (samples, rings and elsewhere, lengths)."""
+        return self._asked("white")
+
+    def at_absorptions(self, sigma_a: float | Sequence[float]) -> np.ndarray:
         """Flux by place at each absorption, shape (samples, places, absorptions)."""
-        histogram, least = self._asked("white"), float(self.medium.sigma_a)
+        histogram, least = self.histogram(), float(self.medium.sigma_a)
         further = np.ravel(np.asarray(sigma_a, dtype=np.float64)) - least
         if not (further.size and np.all(further >= -1e-12 * least) and np.all(np.isfinite(further))):
             raise ValueError(f"sigma_a must be finite and >= {least:g} (1/mm), as traced, got {sigma_a!r}")
@@ -404,12 +408,18 @@ def transformed(flux: np.ndarray, radii: np.ndarray | None, frequencies: Sequenc
 
     if radii is None:
         raise ValueError("radii must be given to trace() for spatial frequencies, got None")
-    f = np.atleast_1d(np.asarray(frequencies, dtype=np.float64))
-    if f.ndim != 1 or not np.all((f >= 0) & np.isfinite(f)):
-        raise ValueError(f"frequencies must be finite and >= 0 (1/mm), got {frequencies!r}")
+    f = checked_frequencies(frequencies)
     beyond = flux[:, -1].sum() / max(flux.sum(), 1e-300)
     if beyond > MOST_BEYOND:
         raise ValueError(f"radii must hold all but {MOST_BEYOND:g} of what leaves, got {beyond:.2g} elsewhere")
     k = 2 * np.pi * np.maximum(f, 1e-12 / radii[-1])[:, None]
     mean = np.diff(radii * j1(k * radii) / k, axis=1) * 2 / np.diff(radii**2)
     return np.einsum("sr...,fr->sf...", flux, np.column_stack([mean, np.where(f == 0, 1.0, 0.0)]))
+
+
+def checked_frequencies(frequencies: Sequence[float]) -> np.ndarray:
+    """Spatial frequencies in 1/mm as an array; ValueError if one is out of range."""
+    f = np.atleast_1d(np.asarray(frequencies, dtype=np.float64))
+    if f.ndim != 1 or not f.size or not np.all((f >= 0) & np.isfinite(f)):
+        raise ValueError(f"frequencies must be finite and >= 0 (1/mm), got {frequencies!r}")
+    return f
