@@ -149,15 +149,17 @@ def _edit(scene: mi.Scene, sky: str, edits: list[str], seed: int) -> Iterator[No
 def _check(load: Callable[[], mi.Scene], sky: str, edits: list[str], seed: int) -> None:
     scene = load()
     found = [_image(scene), *(_image(scene) for _ in _edit(scene, sky, edits, seed))]
-    for number, edit in enumerate(edits, 1):
+    for before, after, edit in zip(found, found[1:], edits):
+        assert np.abs(after - before).max() > 1e-4 * after.max(), edit
+    for number in {*range(2, len(edits), 2), len(edits)}:  # of two edits, either that is missed leaves the image wrong
         del scene  # kernels call the objects of all scenes that there are: one alone needs no new ones
         gc.collect()
         scene = load()
         for _ in _edit(scene, sky, edits[:number], seed):
             pass
         wanted = _image(scene)
-        assert np.abs(wanted - found[number - 1]).max() > 1e-4 * wanted.max(), edit
-        np.testing.assert_allclose(found[number], wanted, rtol=2e-3, atol=1e-4 * wanted.max(), err_msg=edit)
+        told = str(edits[:number])
+        np.testing.assert_allclose(found[number], wanted, rtol=2e-3, atol=1e-4 * wanted.max(), err_msg=told)
 
 
 @pytest.mark.slow

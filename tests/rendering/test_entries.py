@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from rendered import mean_of_pixels, render, surface
+from rendered import independent, mean_of_pixels, render, surface
 
 mi = pytest.importorskip("mitsuba")
 
@@ -70,8 +70,7 @@ def test_several_entries_are_less_noisy_under_a_sky():
             "ball": {"type": "sphere", "bsdf": surface(medium={"sigma_s": 6.0, "sigma_a": 0.1})},
             "sensor": {"type": "orthographic", "to_world": view, "film": film},
         })  # fmt: skip
-        images = np.array([np.array(mi.render(scene, spp=64, seed=k)) for k in range(16)])
-        return images.var(axis=0, ddof=1).mean()
+        return independent(scene, 16, 64).var(axis=0, ddof=1).mean()
 
     assert noise(4) < 0.5 * noise(1)
 

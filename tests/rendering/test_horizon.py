@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from coarse import coarse_ball
-from rendered import direction
+from rendered import direction, independent
 from scipy import stats
 
 mi = pytest.importorskip("mitsuba")
@@ -32,7 +32,7 @@ def images(shape: dict, bsdf: dict, light: dict, spp: int = 64, **integrator) ->
              "ball": {**shape, "bsdf": bsdf},
              "sensor": {"type": "perspective", "fov": 16.0, "to_world": at, "film": film}}  # fmt: skip
     scene = mi.load_dict(scene)
-    found = np.array([np.array(mi.render(scene, spp=spp, seed=k)) for k in range(PASSES)])
+    found = independent(scene, PASSES, spp, pixel_format="rgba")
     covered = (found[..., 3] == 1).all(axis=0)
     assert covered.mean() > 0.5
     return found[:, covered, :3].mean(axis=2)

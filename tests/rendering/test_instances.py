@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rendered import surface
+from rendered import independent, surface
 
 mi = pytest.importorskip("mitsuba")
 dr = pytest.importorskip("drjit")
@@ -70,7 +70,7 @@ def light() -> dict[str, dict]:
 
 def images(scene: dict, spp: int, seed: int, runs: int = 12) -> np.ndarray:
     loaded = mi.load_dict(scene, optimize=False)  # which would merge meshes
-    return np.array([np.array(mi.render(loaded, spp=spp, seed=seed + k), dtype=float) for k in range(runs)])
+    return independent(loaded, runs, spp, seed)
 
 
 def agree(found: np.ndarray, wanted: np.ndarray, known_to: float) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rendered import independent
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -48,7 +49,7 @@ def _scene(how: str, surface: dict, shape: dict | None = None, pixels: int = 8, 
 
 
 def _means(scene: Any, runs: int, spp: int, seed: int) -> np.ndarray:
-    return np.array([np.array(mi.render(scene, spp=spp, seed=seed + k)).mean(axis=(0, 1)) for k in range(runs)])
+    return independent(scene, runs, spp, seed).mean(axis=(1, 2))
 
 
 def _compare(surface: dict, known_to: float, shape: dict | None = None, spp: int = 1024, **more: Any) -> None:
@@ -121,11 +122,8 @@ def test_a_medium_without_absorption_is_invisible_in_uniform_light() -> None:
 
 
 def _mesh(name: str, folder: Path) -> dict:
-    """A bowl, open towards the camera, a ring or a hand, about 10 units wide, without interpolated normals."""
-    meshes, shapes = (
-        pytest.importorskip("full_geometry.learning.meshes"),
-        pytest.importorskip("full_geometry.learning.meshes"),
-    )
+    """A bowl, open towards the camera, or a hand, about 10 units wide, without interpolated normals."""
+    meshes = pytest.importorskip("full_geometry.learning.meshes")
     hands = pytest.importorskip("benchmarks.hand_and_ribbon")
     pytest.importorskip("igl")
 
@@ -133,13 +131,7 @@ def _mesh(name: str, folder: Path) -> dict:
         whole = meshes.ellipsoid(p, (1.0, 1.0, 1.0))
         return np.maximum(np.abs(whole + 0.15) - 0.15, p[..., 2] - 0.3)
 
-    def ring(p: np.ndarray) -> np.ndarray:
-        x, y, z = np.moveaxis(p, -1, 0)
-        return meshes.length(meshes.length(x, y) - 0.7, z) - 0.3
-
-    distance, box = (
-        hands.hand() if name == "hand" else ({"bowl": bowl, "ring": ring}[name], shapes.margin([-1] * 3, [1] * 3))
-    )
+    distance, box = hands.hand() if name == "hand" else (bowl, meshes.margin([-1] * 3, [1] * 3))
     path = meshes.surface(distance, box, 48).write_ply(folder / f"{name}.ply")
     to_world = mi.ScalarTransform4f().scale(9.0 if name == "hand" else 5.0)
     return {"type": "ply", "filename": str(path), "face_normals": True, "to_world": to_world}
@@ -163,7 +155,7 @@ def _furnace(shape: dict, known_to: float, **more: Any) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shape", ["bowl", "ring", "hand"])
+@pytest.mark.parametrize("shape", ["bowl", "hand"])
 def test_a_hollow_or_branching_object_without_absorption_is_invisible_in_uniform_light(
     shape: str, tmp_path: Path
 ) -> None:
@@ -184,9 +176,8 @@ def test_two_balls_without_absorption_are_invisible_in_uniform_light(gap: float)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("gap", [0.0, 0.2])
-def test_precomputed_light_of_two_balls_has_the_mean_of_sampled_light(gap: float) -> None:
-    one, other = _pair(gap)
+def test_precomputed_light_of_two_balls_that_touch_has_the_mean_of_sampled_light() -> None:
+    one, other = _pair(0.0)
     other["bsdf"] = {"type": "translucent", **MEDIUM, "sigma_s": "2.0,1.0,0.7"}
     _compare(MEDIUM, 0.02, one, other=other, lamp=_lamp())
 
@@ -245,21 +236,19 @@ FORWARD = {"sigma_s": "10.0,15.0,20.0", "sigma_a": "0.01,0.05,0.3", "eta": 1.4}
 
 
 @pytest.mark.parametrize(
-    "g", [pytest.param("0.9", marks=pytest.mark.slow), pytest.param("0.95,0.8,0.6", marks=pytest.mark.slow), "-0.6"]
+    "g", [pytest.param("0.95,0.8,0.6", marks=pytest.mark.slow), pytest.param("-0.6", marks=pytest.mark.slow)]
 )
 def test_precomputed_light_of_an_even_sky_has_the_mean_of_sampled_light_at_any_g(g: str) -> None:
     surface = {**(MEDIUM if g == "-0.6" else FORWARD), "g": g}
-    _compare(surface, 0.003, spp=1024, light={"type": "constant"})
+    _compare(surface, 0.003, _ball(3.0), light={"type": "constant"})
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", ["cube", "rough", "thin"])
+@pytest.mark.parametrize("case", ["rough", "thin"])
 def test_precomputed_light_of_a_lamp_has_the_mean_of_sampled_light_where_scattering_is_forward(case: str) -> None:
     """A lamp as wide as the object, so that sampled light is known to 1 %."""
     lamp = {"lamp": _lamp(15.0)}
-    if case == "cube":
-        _compare({**FORWARD, "g": 0.9}, 0.012, _cube(), **lamp)
-    elif case == "rough":
+    if case == "rough":
         rough = {"type": "roughdielectric", "alpha": 0.3, "int_ior": 1.4, "ext_ior": 1.0}
         _compare({**FORWARD, "g": 0.8, "boundary": rough}, 0.012, **lamp)
     else:  # 5 mean free paths
