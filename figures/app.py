@@ -19,6 +19,7 @@ from full_geometry.cli.render import render
 from full_geometry.cli.trade import trade
 from full_geometry.cli.train import errors_object, train_object, train_shapes
 from full_geometry.cli.variants import Drawers
+from full_geometry.cli.view import view
 from halfspace_sss.cli.curves import curves
 from halfspace_sss.cli.errors import errors_materials, errors_truths
 from halfspace_sss.cli.lists import materials_import, materials_list, materials_show, models
@@ -51,6 +52,7 @@ GROUPS: Mapping[str, tuple[str, Mapping[str, Callable]]] = {
 SINGLE = {
     "curves": curves, "fit": fit, "maps": maps, "models": models,
     "render": render, "trade": trade, "validate": validate,
+    "view": view,
 }  # fmt: skip
 
 

@@ -22,8 +22,9 @@ if TYPE_CHECKING:
     from full_geometry.learning.training import train
     from full_geometry.plugins import register
     from full_geometry.transport.storing import load
+    from full_geometry.viewing.page import view
 
-__all__ = ["Recipe", "errors", "inverse", "load", "object_of", "register", "trade", "train", "transport_of"]
+__all__ = ["Recipe", "errors", "inverse", "load", "object_of", "register", "trade", "train", "transport_of", "view"]
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
@@ -36,5 +37,6 @@ __getattr__, __dir__ = lazy_names(
         "trade": "",
         "train": "learning.training",
         "transport_of": "learning.model_errors",
+        "view": "viewing.page",
     },
 )

@@ -12,6 +12,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from types import FrameType
 
 WAIT = 0.02  # seconds; until an interrupt during an import is heard again
@@ -128,6 +129,25 @@ def interruptible() -> Iterator[None]:
         raise KeyboardInterrupt from error
     finally:
         hear_again()
+
+
+_cancelled: ContextVar[Callable[[], bool]] = ContextVar("cancelled", default=lambda: False)
+
+
+@contextmanager
+def cancellable(cancelled: Callable[[], bool]) -> Iterator[None]:
+    """Work within it ends with a KeyboardInterrupt at its next `checkpoint` once `cancelled` says so."""
+    token = _cancelled.set(cancelled)
+    try:
+        yield
+    finally:
+        _cancelled.reset(token)
+
+
+def checkpoint() -> None:
+    """Between parts of long work, each of which leaves what is known whole: end here if that is cancelled."""
+    if _cancelled.get()():
+        raise KeyboardInterrupt
 
 
 def is_interrupt(error: BaseException | None) -> bool:

@@ -28,7 +28,7 @@ FLOORS = {  # of each package, a room or file may import those to its left; "" i
     ],
     "full_geometry": [
         "", "geometry", "surface", "objects", "walk", "transport", "precomputed", "integrators", "scenes",
-        "learning", "inverse", "trade", "plugins", "cli",
+        "learning", "inverse", "trade", "viewing", "plugins", "cli",
     ],
     "figures": ["parts", "modelling", "computing", "drawing", ""],
 }  # fmt: skip

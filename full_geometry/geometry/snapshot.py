@@ -50,6 +50,15 @@ class Snapshot:
         return same_objects(self._nodes, other._nodes) and self._checksums == other._checksums
 
 
+def differing(a: mi.Object, b: mi.Object) -> list[str] | None:
+    """Names of parameters that differ between objects of the same structure; None where that differs."""
+    one, other = mi.traverse(a), mi.traverse(b)
+    kinds = [{key: owner[2].class_name() for key, owner in each.properties.items()} for each in (one, other)]
+    if kinds[0] != kinds[1] or list(one.keys()) != list(other.keys()):
+        return None
+    return [key for key in one.keys() if _checksum(one[key]) != _checksum(other[key])]
+
+
 def same_objects(a: list[mi.Object], b: list[mi.Object]) -> bool:
     """Whether two lists hold the same objects of Mitsuba."""
     return len(a) == len(b) and all(x is y for x, y in zip(a, b))

@@ -35,7 +35,7 @@ from full_geometry.settings import GATHERED_LIGHTS, Choices, Settings, read_sett
 from full_geometry.surface.translucent import is_translucent
 from full_geometry.surface.wrapped import wraps
 from full_geometry.transport.prepare import Chooser, TranslucentObjects, choices_of, make_objects
-from halfspace_sss.interrupts import interruptible
+from halfspace_sss.interrupts import checkpoint, interruptible
 
 SAMPLES_PER_LAUNCH = 2**20  # half a second on 2 cores
 GEOMETRY = ("to_world", mesh.POSITIONS, mesh.NORMALS, mesh.TEXCOORDS)
@@ -132,6 +132,7 @@ def _class(variant: str) -> type:
                 try:
                     sensor.film().prepare([])
                     for launch in launches(sensor, spp):
+                        checkpoint()
                         self._launch(scene, sensor, int(mi.UInt32(seed)[0]), launch)
                         dr.sync_thread()
                 finally:

@@ -32,6 +32,7 @@ from full_geometry.integrators.walk_paths import PathTracer
 from full_geometry.precomputed.surface_regression import ResidualSums, levels, smooth_field
 from full_geometry.precomputed.transport_matrix import bent
 from halfspace_sss.backend import clock
+from halfspace_sss.interrupts import checkpoint
 
 if TYPE_CHECKING:
     from full_geometry.objects.objects import TranslucentObject
@@ -145,6 +146,7 @@ class Corrections:
             for k, known in enumerate(self._known):
                 first, halves = (known.launches, list(known.halves)) if known else (0, _nothing(gathered[k]))
                 for launch in range(first, launches):
+                    checkpoint()
                     seed = SEED + 10_000 * k + 1_000_000 * self._part + launch
                     halves[launch % 2] += residuals(scene, objects, settings, tracer, k, seed)
                 self._known[k] = SurfaceCorrection.of(gathered[k], tuple(halves), launches)

@@ -43,6 +43,7 @@ from full_geometry.precomputed.transport_matrix import (
 )
 from full_geometry.walk.emission import emitter_pdf, mis_weight, sample_emitter
 from halfspace_sss.backend import clock
+from halfspace_sss.interrupts import checkpoint
 
 if TYPE_CHECKING:
     from full_geometry.geometry.instances import InstanceScene
@@ -183,6 +184,7 @@ class Gathering:
         state = light_state(scene)
         if state != self._light:
             # the light, in two parts that tell its noise
+            checkpoint()
             started = clock()
             seed, parts = 1000 * self._part + 10_000 * self._seed, 1 if self._part else 2
             ways = list(zip(self._matrices, self._events))

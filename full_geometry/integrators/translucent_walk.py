@@ -30,7 +30,7 @@ from full_geometry.walk.scores import PathScores, with_derivatives
 from full_geometry.walk.straight_light import find_straight_light
 from halfspace_sss.backend import clock
 from halfspace_sss.checks import check_choice
-from halfspace_sss.interrupts import interruptible
+from halfspace_sss.interrupts import checkpoint, interruptible
 
 PARAMETERS = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters", "connection_share", "blur", "light", "layers")
 SAMPLES_PER_LAUNCH = 2**19
@@ -326,6 +326,7 @@ def _render(
     # launches are so small that their arrays fit, and that an interrupt is heard between them
     most = max(1, _on_device(SAMPLES_PER_LAUNCH) // int(dr.prod(sampled_size(sensor.film()))))
     for launch, start in enumerate(range(0, spp, most)):
+        checkpoint()
         _launch(tracer, sensor, min(most, spp - start), (seed, launch), keep, scored)
 
 

@@ -60,6 +60,7 @@ from full_geometry.geometry.points import (
 )
 from full_geometry.precomputed.entries import PLACES, StratifiedEntries
 from full_geometry.precomputed.point_pairs import EntryPairs, Rays, lit_pairs
+from halfspace_sss.interrupts import checkpoint
 from halfspace_sss.physics.fresnel import F_t
 
 if TYPE_CHECKING:
@@ -372,6 +373,7 @@ def transport_matrix(obj: TranslucentObject, share: float = 1.0, seed: int = SEE
         result = stratified(obj, points, n, seed)
     else:
         result = drawn(obj, points, int(DENSE * n) * len(points), seed)
+    checkpoint()
 
     # ---- S without the reflectance R^e of the exit, and the sums of rows that uniform light has
     paint = None if obj.textured is None else result.paint

@@ -145,10 +145,12 @@ def open_scene(
     parameters: Mapping[str, str] | None = None,
     settings: Mapping[str, float] | None = None,
     floats: bool = False,
+    change: Callable[[ParserState], None] | None = None,
 ) -> mi.Scene:
     """Load a scene as `load_scene` does, but make no model yet.
 
     With `floats`, texels of bitmaps are floats, which can be changed by any amount, whatever their files have.
+    `change` may change the scene as it was parsed.
     """
     light = (settings or {}).get("light")
     walks = model == PATH_TRACED
@@ -158,6 +160,8 @@ def open_scene(
         if value is not None:
             check_choice(name, value, choices)
     state, config = parsed(scene, parameters or {})
+    if change is not None:
+        change(state)
     names = [str(props.get("model", "")) for props in _surfaces(state)]
     _transform(scene, state, config, apart=walks or _apart(state, model))
     for props in _surfaces(state):  # anew: the nodes have moved

@@ -32,13 +32,13 @@ def cover(scene: mi.Scene, spp: int = GUIDE_SPP) -> np.ndarray:
     return _cover(_aovs(scene, "n:sh_normal", spp, 0))
 
 
-def guides(scene: mi.Scene, sensor: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def guides(scene: mi.Scene, sensor: mi.Sensor | int = 0, spp: int = GUIDE_SPP) -> tuple[np.ndarray, np.ndarray]:
     """Mean albedo of each pixel (H, W, 3) and mean shading normal (H, W, 3), both float32.
 
     The albedo of translucent objects is their directional albedo. Where there is none at all, as of mirrors and glass,
     it is the cover of the pixel, as Open Image Denoise asks.
     """
-    return guides_of(_aovs(scene, GUIDES, GUIDE_SPP, sensor))
+    return guides_of(_aovs(scene, GUIDES, spp, sensor))
 
 
 def guides_of(aovs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -47,7 +47,7 @@ def guides_of(aovs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.where(albedo.any(axis=2, keepdims=True), albedo, _cover(normal)[..., None]), np.clip(normal, -1, 1)
 
 
-def _aovs(scene: mi.Scene, aovs: str, spp: int, sensor: int) -> np.ndarray:
+def _aovs(scene: mi.Scene, aovs: str, spp: int, sensor: mi.Sensor | int) -> np.ndarray:
     import mitsuba as mi
 
     integrator = mi.load_dict({"type": "aov", "aovs": aovs})

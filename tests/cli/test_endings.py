@@ -38,6 +38,7 @@ SMALL = {  # a small run of each command, and what it refuses
     "train shapes": (["--out", "o"], ["--mesh", "none.ply"]),
     "train universal": (["--out", "o"], ["--steps", "0"]),
     "validate": (["--rows", "thirdparty", "--quick", "--out", "o"], ["--rows", "nope"]),
+    "view": (["ball.xml", "--port", "0"], ["none.xml"]),
 }
 HARNESS = """
 import atexit, gc, json, os, signal, subprocess, sys
@@ -106,7 +107,8 @@ LONG = (
     "train object",
     "train shapes",
     "train universal",
-)  # minutes
+    "view",
+)  # minutes, or without an end
 
 
 def _run(command: str, column: str, folder: Path) -> tuple[str, str | None, str, list[str]]:

@@ -1,0 +1,305 @@
+"""A scene that is looked at while it is changed: edits of it, and its images in passes. No page is needed for it."""
+
+from __future__ import annotations
+
+import gc
+import math
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from full_geometry.geometry.sensors import seeded
+from full_geometry.geometry.snapshot import differing
+from full_geometry.integrators.bssrdf import is_bssrdf
+from full_geometry.objects.objects import translucent_shapes
+from full_geometry.scenes.reference_store import Reference, finite_pixels
+from full_geometry.scenes.scene_files import first_cause, open_scene, parsed
+from full_geometry.settings import OF_MITSUBA, PATH_TRACED, SHARED
+from full_geometry.surface.wrapped import surface_of
+from full_geometry.trade.denoising import denoised, guides
+from full_geometry.viewing.edits import (
+    Camera,
+    Edits,
+    Way,
+    change,
+    integrator_props,
+    name_nodes,
+    names_of,
+    put_camera,
+    put_integrator,
+)
+from halfspace_sss.physics.medium import Medium
+from halfspace_sss.provenance import write_atomically
+
+COARSE = 4  # one of so many pixels of each row and column comes first
+BRIEF = 0.15  # seconds; passes that take longer have no more samples, as edits wait for one
+SHARE = 4  # a pass has at most a quarter of the samples so far
+MOST = 4096  # samples of a pixel
+GUIDE_SPP = 4
+MAPS = (".exr", ".hdr")
+
+
+class Shown(NamedTuple):
+    """An image that is shown.
+
+    Args:
+        image: linear radiance (H, W, 3).
+        spp: samples of a pixel; 0 for a coarse image.
+        error: relative standard error of the image before denoising; infinite where it is not known.
+        seconds: that its passes took.
+        ready: of these, those of the first: models made, light found.
+        told: on light that was gathered or corrected, with its error.
+    """
+
+    image: np.ndarray
+    spp: int
+    error: float
+    seconds: float
+    ready: float
+    told: tuple[str, ...]
+
+
+class LiveScene:
+    """A scene with edits. All of it is for one thread.
+
+    An edit changes the scene in place where that is possible, so that integrators keep what they know of it, and
+    loads it anew elsewhere. Images are those of the scene that `save` writes.
+
+    Args:
+        scene: the path of an XML file, or a dict as for `mitsuba.load_dict`.
+        parameters: values of the parameters $name of an XML file.
+
+    Raises:
+        ValueError: as `open_scene`.
+    """
+
+    def __init__(self, scene: dict | str | Path, parameters: Mapping[str, str] | None = None) -> None:
+        self.source, self._parameters = scene, dict(parameters or {})
+        self.file = None if isinstance(scene, dict) else Path(scene).resolve()
+        self.folder = Path.cwd() if self.file is None else self.file.parent
+        self.edits, self._integrators = Edits(), {}
+        self._turning: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+        self.scene = self._open(self.edits)
+        state, _ = parsed(scene, self._parameters)
+        props = integrator_props(state)
+        given = {} if props is None else {key: props[key] for key in props.keys() if key not in OF_MITSUBA}
+        self._shared = {key: given[key] for key in SHARED if key in given}
+        self.names = list(names_of(state))
+        walks = is_bssrdf(self.scene.integrator()) is False
+        light = "precomputed" if walks else "gathered"
+        self.way = Way(PATH_TRACED if walks else str(given.get("model", "")), str(given.get("light", light)))
+        self._written = self._time()
+
+    # ---- what there is to choose
+
+    def environments(self) -> list[str]:
+        """Maps in the folder of the scene, and in folders of it, by their paths from there."""
+        here = self.folder.resolve()
+        files = sorted(path for path in here.rglob("*") if path.suffix.lower() in MAPS and path.is_file())
+        return [path.relative_to(here).as_posix() for path in files if path.resolve().is_relative_to(here)]
+
+    def medium(self, name: str) -> Medium:
+        """The medium of an object as it is, 1/mm."""
+        return self._surfaces()[name].spec.medium
+
+    def _surfaces(self) -> dict[str, Any]:
+        found = []
+        for surface in map(surface_of, translucent_shapes(self.scene)):
+            found += [surface] if all(surface is not each for each in found) else []
+        return dict(zip(self.names, found))
+
+    def camera(self, pixels: int) -> Camera:
+        """That of the first sensor, with about so many pixels; before the objects where there is none."""
+        if not self.scene.sensors():
+            _, centre, size = self._frame()
+            pose = mi.ScalarTransform4f().look_at(list(centre + [0, 0, 3 * size]), list(centre), [0, 1, 0])
+            return Camera(_rows(pose.matrix), 40.0, math.isqrt(pixels), math.isqrt(pixels))
+        sensor = self.scene.sensors()[0]
+        width, height = (int(v) for v in sensor.film().crop_size())
+        parameters = mi.traverse(sensor)
+        x_fov = float(parameters["x_fov"][0]) if "x_fov" in parameters else 40.0
+        fov = math.degrees(2 * math.atan(math.tan(math.radians(x_fov) / 2) * height / width))
+        scale = math.sqrt(pixels / (width * height))
+        return Camera(
+            _rows(sensor.world_transform().matrix), fov, max(round(scale * width), 1), max(round(scale * height), 1)
+        )
+
+    def stale(self) -> bool:
+        """Whether the file has been written since it was read."""
+        return self._time() != self._written
+
+    def _time(self) -> int:
+        return self.file.stat().st_mtime_ns if self.file is not None and self.file.exists() else 0
+
+    # ---- edits
+
+    def apply(self, edits: Edits) -> None:
+        """Bring the scene to these edits; ValueError leaves it as it was."""
+        if edits == self.edits:
+            return
+        if edits.environment and edits.environment not in self.environments():
+            raise ValueError(f"environment must be a map in the folder of the scene, got {edits.environment!r}")
+        fresh = self._open(edits)
+        if not _brought(self.scene, fresh):
+            # objects have the numbers of those before once these are gone, and kernels that know them are found again
+            del fresh
+            self.scene, self._integrators = None, {}
+            gc.collect()
+            self.scene = self._open(edits)
+        self.edits = edits
+
+    def _open(self, edits: Edits) -> mi.Scene:
+        def changed(state: mi.parser.ParserState) -> None:
+            if edits != Edits():
+                change(state, edits, self._turned(edits))
+            name_nodes(state)
+
+        scene = open_scene(self.source, parameters=self._parameters, change=changed)
+        _put(scene, mi.traverse(scene), _of_light(scene))
+        return scene
+
+    def _frame(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """The vertical by the first sensor, the middle of all objects, and half their size, as the file has them."""
+        if self._turning is None:
+            sensors = self.scene.sensors()
+            up = np.array(sensors[0].world_transform().matrix).reshape(4, 4)[:3, 1] if sensors else np.eye(3)[1]
+            axis = np.eye(3)[np.argmax(np.abs(up))] * np.sign(up[np.argmax(np.abs(up))])
+            boxes = [shape.bbox() for shape in translucent_shapes(self.scene)]
+            low = np.min([np.array(box.min) for box in boxes], axis=0)
+            high = np.max([np.array(box.max) for box in boxes], axis=0)
+            self._turning = axis, (low + high) / 2, float(np.max(high - low)) / 2
+        return self._turning
+
+    @property
+    def up(self) -> np.ndarray:
+        """The axis of the world that is up for the first sensor."""
+        return self._frame()[0]
+
+    @property
+    def centre(self) -> np.ndarray:
+        """The middle of all objects."""
+        return self._frame()[1]
+
+    def _turned(self, edits: Edits) -> np.ndarray:
+        """The transformation of all light."""
+        up, centre, _ = self._frame()
+        across = np.roll(up, 1)
+        move = mi.ScalarAffineTransform4d().translate(centre)
+        move = move @ mi.ScalarAffineTransform4d().rotate(up, edits.turn)
+        move = move @ mi.ScalarAffineTransform4d().rotate(across, edits.tilt)
+        return np.array((move @ mi.ScalarAffineTransform4d().translate(-centre)).matrix)
+
+    def save(self, name: str, way: Way, camera: Camera, edits: Edits) -> str:
+        """Write the scene as it is into its folder, as a new file or over one that `save` has written.
+
+        Args:
+            name: of the file, without folders.
+            way: becomes its integrator.
+            camera: becomes its first sensor.
+            edits: what is changed.
+
+        Returns:
+            The command that renders it.
+
+        Raises:
+            ValueError: the name has a folder, does not end in .xml, or is the one of the scene that is looked at.
+        """
+        path = self.folder / name
+        if Path(name).name != name or path.suffix != ".xml" or path == self.file:
+            raise ValueError(f"name must be of a new .xml file beside the scene, without folders, got {name!r}")
+        state, _ = parsed(self.source, self._parameters)
+        if edits != Edits():
+            change(state, edits, self._turned(edits))
+        put_integrator(state, way.plugin(self._shared))
+        put_camera(state, camera)
+        write_atomically(path, mi.parser.write_string(state).encode())
+        return f"halfspace-sss render {path} --spp 64" + (" --denoise" if way.denoise else "")
+
+    # ---- images
+
+    def integrator(self, way: Way) -> mi.Integrator:
+        """Made once for a way; it keeps what it knows of the scene until that is loaded anew."""
+        if way not in self._integrators:
+            self._integrators[way] = mi.load_dict(way.plugin(self._shared))
+        return self._integrators[way]
+
+    def passes(self, camera: Camera, way: Way, seed: int = 0) -> Iterator[Shown]:
+        """Images of the scene as it is: a coarse one, then means of ever more passes.
+
+        Work is cancelled by `halfspace_sss.interrupts.cancellable`, and then leaves what is known whole.
+
+        Raises:
+            ValueError: the integrator refuses the scene.
+        """
+        started, integrator, guide = time.perf_counter(), self.integrator(way), None
+        coarse = _pass(self.scene, integrator, camera.sensor(COARSE), seed, 1)
+        ready = time.perf_counter() - started
+        told = tuple(integrator.gathered) if is_bssrdf(integrator) else ()
+        rows, columns = (np.arange(n) * m // n for n, m in zip((camera.height, camera.width), coarse.shape))
+        yield Shown(coarse[rows][:, columns, :3], 0, math.inf, ready, ready, told)
+        sensor, mean, spp, last = camera.sensor(), None, 1, 0.0
+        while mean is None or mean.spp < MOST:
+            begun = time.perf_counter()
+            image = _pass(self.scene, integrator, sensor, seeded(seed, mean.passes if mean else 0), spp)
+            last = time.perf_counter() - begun
+            mean = (mean or Reference.empty(image.shape, {})).add(image, spp, last)
+            shown = mean.mean[..., :3]
+            if way.denoise:
+                guide = guide or guides(self.scene, sensor, GUIDE_SPP)
+                emission = mean.mean[..., -3:] if mean.mean.shape[2] > 3 else 0.0
+                shown = denoised(np.maximum(shown - emission, 0), *guide)[0] + emission
+            yield Shown(shown, mean.spp, mean.relative_error, ready + mean.seconds, ready, told)
+            spp = 2 * spp if last < BRIEF and SHARE * 2 * spp <= mean.spp else spp
+
+
+def _rows(matrix: object) -> tuple[tuple[float, ...], ...]:
+    """A matrix, of one Dr.Jit lane or none, as numbers that can be compared."""
+    return tuple(map(tuple, np.array(matrix, dtype=float).reshape(4, 4).tolist()))
+
+
+def _pass(scene: mi.Scene, integrator: mi.Integrator, sensor: mi.Sensor, seed: int, spp: int) -> np.ndarray:
+    try:
+        return finite_pixels("the image", integrator.render(scene, sensor, seed=seed, spp=spp))
+    except RuntimeError as error:
+        raise ValueError(first_cause(error)) from error
+
+
+def _brought(scene: mi.Scene, wanted: mi.Scene) -> bool:
+    """Change a scene in place to another of the same file, if it can be: the index of a boundary cannot."""
+    keys = differing(scene, wanted)
+    if keys is None or any(".boundary." in key for key in keys):
+        return False
+    _put(scene, mi.traverse(wanted), keys)
+    return True
+
+
+def _put(scene: mi.Scene, values: Mapping[str, Any], keys: list[str]) -> None:
+    """Give parameters values that are data of kernels: literals would be code, compiled anew for each other value."""
+    parameters = mi.traverse(scene)
+    for key in keys:
+        value = type(values[key])(values[key])
+        dr.make_opaque(value)
+        parameters[key] = value
+    parameters.update()
+
+
+def _of_light(scene: mi.Scene) -> list[str]:
+    """Numbers and transformations of emitters."""
+    parameters = mi.traverse(scene)
+
+    emitters = {emitter.id() for emitter in scene.emitters() if emitter.get_shape() is None}
+    lamps = {shape.id() for shape in scene.shapes() if shape.is_emitter()}
+
+    def wanted(key: str) -> bool:
+        (name, _, inner), value = key.partition("."), parameters[key]
+        if inner == "to_world":
+            return name in emitters | lamps
+        numbers = dr.is_jit_v(value) and not dr.is_tensor_v(value) and dr.width(value) == 1
+        return numbers and (name in emitters or name in lamps and inner.startswith("emitter."))
+
+    return [key for key in parameters.keys() if wanted(key)]
