@@ -9,7 +9,7 @@ from benchmarks.inversion_command import inversion_command
 from benchmarks.rivals_command import rivals_command
 from benchmarks.shapes_command import shapes_command
 from benchmarks.speeds_command import gathered_command, speeds_command
-from benchmarks.total_error_command import total_error_command
+from benchmarks.total_error_command import time_to_error_command, total_error_command
 from benchmarks.trade_check_command import check_command
 from figures.parts.command import COMMANDS as FIGURES
 from halfspace_sss.cli.shared import Commands, add, group
@@ -25,6 +25,7 @@ COMMANDS = {
     "rivals": rivals_command,
     "shapes": shapes_command,
     "speeds": speeds_command,
+    "time-to-error": time_to_error_command,
     "total-error": total_error_command,
     "trade-check": check_command,
 }

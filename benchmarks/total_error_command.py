@@ -13,7 +13,7 @@ from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.cli.shared import Bar, OutFolder, console, whole
 from halfspace_sss.provenance import check_folder, write_together
 
-__all__ = ["total_error_command"]
+__all__ = ["time_to_error_command", "total_error_command"]
 
 OBJECTS = ("hand of potato", "ribbon of cream", "bunny of skin1")
 
@@ -59,4 +59,52 @@ def total_error_command(
         {out / "total_error.csv": csv, out / "total_error.md": text, out / "total_error.pdf": drawn["pdf"],
          out / "total_error.png": drawn["png"]}
     )  # fmt: skip
+    console().print(text, highlight=False, markup=False, soft_wrap=True)
+
+
+TIMED = tuple(
+    f"{shape} of {material}"
+    for shape, materials in (
+        ("hand", ("potato", "wholemilk")), ("ribbon", ("ketchup", "marble")),
+        ("bunny", ("skin1", "wholemilk", "ketchup")), ("dragon", ("marble", "potato", "skin1")),
+    )
+    for material in materials
+)  # fmt: skip
+
+
+def time_to_error_command(
+    objects: Annotated[
+        list[str] | None, typer.Option("--object", help="As of `speeds`; repeat for more.", show_default="ten")
+    ] = None,
+    light: Annotated[
+        list[str] | None, typer.Option(help="As of `speeds`; repeat for more.", show_default="the first two there")
+    ] = None,
+    pixels: Annotated[float, typer.Option(help="Relative error of pixels to reach.")] = 0.04,
+    blocks: Annotated[float, typer.Option(help="Relative error of means over 8 x 8 pixels to reach.")] = 0.015,
+    most: Annotated[float, typer.Option(help="CPU seconds after which a technique is given up.")] = 60.0,
+    size: Annotated[int, typer.Option(help="Pixels of the square images.", parser=whole)] = 512,
+    seed: Annotated[int, typer.Option(help="Seed of all renders.", parser=whole)] = 0,
+    out: OutFolder = Path("time_to_error"),
+) -> None:
+    """Measure CPU seconds to a total error of denoised path tracing, of walks and of volpathmis: all orders."""
+    use_mitsuba("llvm_ad_rgb")
+    from benchmarks.speeds import LIGHTS, OTHER_LIGHTS, LitObject
+    from benchmarks.time_to_error import ErrorsWanted, times_to_error
+
+    lights = tuple(light or LIGHTS)
+    for name in lights:
+        check_choice("light", name, (*LIGHTS, *OTHER_LIGHTS))
+    for name, value in (("pixels", pixels), ("blocks", blocks)):
+        check_interval(name, value, 1e-4, 1.0)
+    check_interval("most", most, 0.1, 1e6)
+    check_count("size", size, 16)
+    check_count("seed", seed, 0)
+    check_folder(out)
+    cases = [LitObject(name, each) for name in objects or TIMED for each in lights]
+    with Bar("time to error") as bar:
+        how = ErrorsWanted(pixels, blocks, most, size, seed)
+        table = times_to_error(cases, how, out / "work", lambda what, k, n: bar.show(k, n, what))
+    text = markdown(table.round(3))
+    csv = table.to_csv(index=False, lineterminator="\n")
+    write_together({out / "time_to_error.csv": csv, out / "time_to_error.md": text})
     console().print(text, highlight=False, markup=False, soft_wrap=True)

@@ -49,34 +49,66 @@ class Denoised(NamedTuple):
         return f"denoised: {self.error:.2%} ± {self.standard_error:.2%} off, with the bias of the denoiser"
 
 
+class Halves(NamedTuple):
+    """Two halves of the samples, (H, W, 3).
+
+    Args:
+        A, B: their means.
+        V_A, V_B: variances of these.
+        D_A, D_B: both denoised.
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    V_A: np.ndarray
+    V_B: np.ndarray
+    D_A: np.ndarray
+    D_B: np.ndarray
+
+    @classmethod
+    def of(cls, found: Reference, denoise: Denoise) -> Halves:
+        """Of a render with halves, of two passes at least."""
+        # the variance of one sample is that of the mean times the samples
+        n, spp, variance = found.half_spp, found.spp, found.variance[..., :3]
+        A, B = found.half, (spp * found.mean - n * found.half) / (spp - n)
+        return cls(A[..., :3], B[..., :3], variance * (spp / n), variance * (spp / (spp - n)), denoise(A), denoise(B))
+
+    @property
+    def share(self) -> float:
+        """s, by which the noisy halves join the denoised ones."""
+        e, V = max(float(np.sum(self._held())), 0.0), float((self.V_A + self.V_B).sum())
+        return e / (e + V) if e + V > 0 else 0.0
+
+    def _held(self) -> tuple[np.ndarray, np.ndarray]:
+        """Estimates of e_A² and e_B² of the pixels."""
+        return (self.D_A - self.B) ** 2 - self.V_B, (self.D_B - self.A) ** 2 - self.V_A
+
+    def mixed(self, s: float) -> tuple[np.ndarray, np.ndarray]:
+        """P and Q."""
+        return (1 - s) * self.D_A + s * self.B, (1 - s) * self.D_B + s * self.A
+
+    def squared(self, s: float) -> tuple[np.ndarray, float]:
+        """Estimates of e² of the pixels, (H, W, 3), and the part of their sum that is noise, not bias."""
+        (e_A, e_B), (P, Q), V = self._held(), self.mixed(s), self.V_A + self.V_B
+        noise = 0.25 * ((1 - s) ** 2 * np.square(self.D_A - self.D_B).sum() + s**2 * V.sum())
+        return 0.5 * ((1 - s) ** 2 * (e_A + e_B) + s**2 * V) - 0.25 * (P - Q) ** 2, float(noise)
+
+
 def cross_denoised(found: Reference, denoise: Denoise) -> Denoised:
     """The mean of both denoised halves of a render; all of it denoised where no halves are known.
 
     Args:
         found: with its half.
-        denoise: a denoiser, as of `trade.denoising.Denoiser`.
+        denoise: a denoiser, as `trade.denoising.Denoiser`.
     """
     if found.half is None or found.passes < 2:
         return Denoised(denoise(found.mean), math.inf, math.inf)
-
-    # ---- means and variances of the halves; the variance of one sample is that of the mean times the samples
-    n, spp = found.half_spp, found.spp
-    A, B = found.half, (spp * found.mean - n * found.half) / (spp - n)
-    variance = found.variance[..., :3]
-    V_A, V_B = variance * (spp / n), variance * (spp / (spp - n))
-
-    # ---- denoised halves, and their squared errors over the image
-    D_A, D_B, A, B = denoise(A), denoise(B), A[..., :3], B[..., :3]
-    e_A, e_B = (D_A - B) ** 2 - V_B, (D_B - A) ** 2 - V_A
-    e, V = max(float((e_A + e_B).sum()), 0.0), float((V_A + V_B).sum())
-    s = e / (e + V) if e + V > 0 else 0.0
-
-    # ---- each with its share of the other half, and what both are off
-    P, Q = (1 - s) * D_A + s * B, (1 - s) * D_B + s * A
-    squared = 0.5 * ((1 - s) ** 2 * (e_A + e_B) + s**2 * (V_A + V_B)) - 0.25 * (P - Q) ** 2
+    halves = Halves.of(found, denoise)
+    s = halves.share
+    P, Q = halves.mixed(s)
+    squared, noise = halves.squared(s)
     squared = squared.sum(axis=2).ravel()
-    least = 0.25 * float((1 - s) ** 2 * np.square(D_A - D_B).sum() + s**2 * (V_A + V_B).sum())  # the noise alone
-    whole = max(float(np.square(found.mean[..., :3]).sum() - variance.sum()), 1e-30)
-    noise = math.sqrt(squared.size) * float(squared.std()) / whole
-    error = math.sqrt(max(float(squared.sum()), least) / whole)
-    return Denoised(0.5 * (P + Q), error, noise / (2 * max(error, math.sqrt(noise), 1e-15)))
+    whole = max(float(np.square(found.mean[..., :3]).sum() - found.variance[..., :3].sum()), 1e-30)
+    error = math.sqrt(max(float(squared.sum()), noise) / whole)
+    spread = math.sqrt(squared.size) * float(squared.std()) / whole
+    return Denoised(0.5 * (P + Q), error, spread / (2 * max(error, math.sqrt(spread), 1e-15)))

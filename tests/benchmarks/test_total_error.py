@@ -27,6 +27,19 @@ def test_the_noise_of_the_reference_is_taken_off() -> None:
     assert off == pytest.approx(0.05, rel=0.1)
 
 
+def test_the_error_of_blocks_is_the_noise_of_pixels_over_their_width() -> None:
+    from benchmarks.time_to_error import _errors
+    from full_geometry.scenes.reference_store import Reference
+
+    rng, found = np.random.default_rng(3), Reference.empty((64, 64, 3), {}, halves=True)
+    for _ in range(16):
+        found = found.add(rng.gamma(4.0, 0.25, (64, 64, 3)), 1, 0.0)
+    errors = _errors(found, lambda image: image)
+    assert errors["raw pixels"] == pytest.approx(0.5 / 4, rel=0.05)
+    assert errors["raw pixels"] / errors["raw blocks"] == pytest.approx(8, rel=0.15)
+    assert errors["pixels"] == pytest.approx(errors["raw pixels"], rel=0.1)
+
+
 @pytest.mark.slow
 def test_precomputed_light_comes_nearer_to_the_reference_in_more_time(tmp_path: Path) -> None:
     from benchmarks.speeds import LitObject

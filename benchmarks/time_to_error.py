@@ -1,0 +1,125 @@
+"""CPU seconds from a fresh scene to a total error of denoised path tracing, at kernels that are known.
+
+Passes grow, and whenever the samples have grown by half the halves are denoised and compared
+(`full_geometry.scenes.cross_denoising`), for pixels and for means over blocks of 8 x 8. No reference is rendered: the
+error is estimated without bias from the halves, but for the bias of precomputed light, below .3 %. The time of raw path
+tracing follows from its variance. Ways are walks with precomputed light and Mitsuba's `volpathmis`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pandas
+
+from benchmarks.speeds import VOLUMES, LitObject
+from benchmarks.total_error import BLOCK, PRECOMPUTED
+from figures.computing.contenders import ready
+from figures.computing.scans import prepare
+from figures.parts.part import Row
+from full_geometry.scenes.cross_denoising import Denoise, Halves
+from full_geometry.scenes.reference_store import Reference
+from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
+from full_geometry.trade.denoising import Denoiser
+
+FEWEST_PASSES = 8
+GROWTH, SHARE, LARGEST_PASS = 1.5, 8, 64  # of samples between errors, and of passes
+
+
+@dataclass(frozen=True)
+class ErrorsWanted:
+    """What is reached, and how it is measured.
+
+    Args:
+        pixels, blocks: relative errors.
+        most: CPU seconds after which a way is given up.
+        size: pixels of the square images.
+        seed: of all renders.
+    """
+
+    pixels: float = 0.04
+    blocks: float = 0.015
+    most: float = 60.0
+    size: int = 512
+    seed: int = 0
+
+
+def times_to_error(
+    cases: Sequence[LitObject], how: ErrorsWanted, folder: Path, progress: Callable[[str, int, int], None]
+) -> pandas.DataFrame:
+    """A row for each case and way: seconds to the error, denoised and raw, and what is reached."""
+    prepare()
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = []
+    for k, case in enumerate(cases):
+        progress(f"{case.name}, {case.light}", k, len(cases))
+        rows += [_row(case, way, how, folder) for way in (PRECOMPUTED, VOLUMES[0])]
+    return pandas.DataFrame(rows)
+
+
+def _scene(case: LitObject, way: str, how: ErrorsWanted, folder: Path) -> mi.Scene | tuple[mi.Scene, ...]:
+    found = case.description(how.size, folder)
+    if way in VOLUMES:
+        return ready(way, found, case.key, case.medium)
+    return load_scene(found, PATH_TRACED, settings={"light": "precomputed", "layers": True})
+
+
+def _row(case: LitObject, way: str, how: ErrorsWanted, folder: Path) -> Row:
+    """Passes of a fresh scene until both errors are reached; a scene before it compiles the kernels."""
+    compiled = _scene(case, way, how, folder)
+    denoise = Denoiser(compiled if isinstance(compiled, mi.Scene) else compiled[0])
+    for spp in (1, 2, 4, 8, 16, 32):
+        _image(compiled, spp, how.seed)
+    scene, started, seed = _scene(case, way, how, folder), time.process_time(), how.seed + 1
+    found, last = None, 0
+    while True:
+        done = found.spp if found else 0
+        spp = min(2 ** (max(done // SHARE, 1).bit_length() - 1), LARGEST_PASS)
+        image = _image(scene, spp, seed)
+        found = (found or Reference.empty(image.shape, {}, halves=True)).add(image, spp, 0.0)
+        seconds, seed = time.process_time() - started, seed + 1
+        if found.passes < FEWEST_PASSES or (found.spp < GROWTH * last and seconds < how.most):
+            continue
+        errors, last = _errors(found, denoise), found.spp
+        seconds = time.process_time() - started
+        reached = errors["pixels"] <= how.pixels and errors["blocks"] <= how.blocks
+        if reached or seconds > how.most:
+            break
+    raw = max(errors["raw pixels"] / how.pixels, errors["raw blocks"] / how.blocks) ** 2 * seconds
+    told = {f"{name}, %": 100 * value for name, value in errors.items()}
+    return {
+        "object": case.name, "light": case.light, "way": way, "seconds": seconds if reached else np.inf,
+        "spp": found.spp, **told, "seconds, raw": raw,
+    }  # fmt: skip
+
+
+def _image(scene: mi.Scene | tuple[mi.Scene, ...], spp: int, seed: int) -> np.ndarray:
+    """One pass; three scenes have a channel each."""
+    scenes = scene if isinstance(scene, tuple) else (scene,)
+    parts = [np.array(mi.render(one, spp=spp, seed=100_000 * k + seed)) for k, one in enumerate(scenes)]
+    return parts[0] if len(parts) == 1 else np.stack([part[..., k] for k, part in enumerate(parts)], axis=2)
+
+
+def _errors(found: Reference, denoise: Denoise) -> dict[str, float]:
+    """Relative errors of pixels and blocks, denoised and raw."""
+    halves, variance = Halves.of(found, denoise), found.variance[..., :3]
+    mean, s, result = found.mean[..., :3], halves.share, {}
+    for name, size in (("pixels", 1), ("blocks", BLOCK)):
+        A, B, V_A, V_B, D_A, D_B = (_means(x, size) for x in halves)
+        means = Halves(A, B, V_A / size**2, V_B / size**2, D_A, D_B)
+        squared, noise = means.squared(s)
+        whole = np.square(_means(mean, size)).sum() - _means(variance, size).sum() / size**2
+        result[name] = float(np.sqrt(max(squared.sum(), noise) / whole))
+        result[f"raw {name}"] = float(np.sqrt(_means(variance, size).sum() / size**2 / whole))
+    return result
+
+
+def _means(x: np.ndarray, size: int) -> np.ndarray:
+    """Over blocks of `size` x `size` pixels."""
+    n, m = x.shape[0] // size, x.shape[1] // size
+    return x[: n * size, : m * size].reshape(n, size, m, size, -1).mean(axis=(1, 3))
