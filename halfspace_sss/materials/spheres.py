@@ -88,7 +88,7 @@ def from_spheres(
         file: an `.rxt` file.
         uncertainty: standard deviation of M_R and M_T, in units of 1, which the files do not state.
         g: mean cosine where the file does not tell it, (-1, 1).
-        sigma_s_prime: reduced scattering of a sample of which only M_R is given, 1/mm.
+        sigma_s_prime: reduced scattering where only M_R is given, 1/mm.
 
     Raises:
         ValueError: the file cannot be read (names it and the line), its readings are not corrected for spheres, or a

@@ -112,7 +112,7 @@ def _sources(m: _Modes, basis: _Basis, inside: float) -> tuple[np.ndarray, np.nd
 
 
 class SlabFluxes(NamedTuple):
-    """Of a slab between slides, per incident flux, all reflections included: of light along the normal, and diffuse."""
+    """Fractions of incident flux of a slab between slides; all but the last for light along the normal."""
 
     reflectance: float
     transmittance: float
