@@ -155,7 +155,7 @@ def test_errors_of_fits_to_noisy_images_are_those_that_are_stated(tmp_path: Path
     image = _target(scene, 8192)
     for seed in range(20):
         noise = 1 + 0.1 * np.random.default_rng(100 + seed).standard_normal(image.shape)
-        settings = inverse.FitSettings(steps=12, spp=32, loss=loss, seed=seed)
+        settings = inverse.FitSettings(steps=8, spp=32, loss=loss, seed=seed)
         found = inverse.fit(tmp_path / "a.xml", [GivenView.of("a", 0, image * noise)], ("albedo",), settings=settings)
         z.append((found.values["albedo"] - TRUE["albedo"]) / found.errors["albedo"])
         assert not found.is_misfit and "residuals: noise, chi-square" in found.lines()[-1]

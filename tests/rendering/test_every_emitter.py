@@ -247,7 +247,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Iterator[np.ndarray]:
         patch.setenv("HALFSPACE_SSS_WEIGHTS", str(folder))
         patch.setattr(training, "WALKS", 512)
         shape = mi.load_dict(_scene({"type": "bssrdf"}, {"sky": {"type": "constant"}}, orders="multiple"))
-        found = training.train(shape, None, chunks=8, recipe=recipe, folder=folder)
+        found = training.train(shape, None, chunks=5, recipe=recipe, folder=folder)
         yield np.array([row.error + 2 * row.standard_error for row in found.errors if row.light == LIGHTS[0]])
 
 
