@@ -54,15 +54,15 @@ def check_finite(name: str, value: object) -> None:
         raise ValueError(f"{name} must be a finite number, got {_plain(value)!r}")
 
 
-def check_edges(name: str, value: object) -> np.ndarray:
-    """The edges of rings or cells (mm) as an array."""
+def check_edges(name: str, value: object, kind: str = "lengths >= 0 in mm") -> np.ndarray:
+    """The edges of rings or cells as an array."""
     try:
         edges = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be lengths in mm, got {value!r}") from error
+        raise ValueError(f"{name} must be {kind.replace(' >= 0', '')}, got {value!r}") from error
     enough = edges.ndim == 1 and len(edges) > 1 and np.all(np.isfinite(edges))
     if not enough or edges[0] < 0 or np.any(np.diff(edges) <= 0):
-        raise ValueError(f"{name} must be two or more finite, ascending lengths >= 0 in mm, got {edges.tolist()}")
+        raise ValueError(f"{name} must be two or more finite, ascending {kind}, got {edges.tolist()}")
     return edges
 
 

@@ -31,7 +31,6 @@ class SphereFile:
     Attributes:
         eta, eta_slide: index of the sample, and of its slides, 1 for none.
         thickness: of the sample, mm.
-        n_spheres: 0 where readings are corrected already, 1 or 2.
         wavelengths: nm, or the numbers of the rows where the file has none.
         rows: readings by name, M_R, M_T, M_U and others, each of shape (rows,).
     """
@@ -39,7 +38,6 @@ class SphereFile:
     eta: float
     eta_slide: float
     thickness: float
-    n_spheres: int
     wavelengths: np.ndarray
     rows: dict[str, np.ndarray]
 
@@ -97,8 +95,6 @@ def from_spheres(
     check_interval("uncertainty", uncertainty, 1e-9, 1.0)
     check_interval("g", g, -0.99, 0.99)
     data = read_spheres(file)
-    if data.n_spheres:
-        raise ValueError(f"{Path(file).name}: number of spheres must be 0, of corrected readings, got {data.n_spheres}")
     if "M_T" not in data.rows and sigma_s_prime is None:
         raise ValueError(f"{Path(file).name}: sigma_s_prime must be given where M_R alone is measured, got None")
     start, found = None, []
@@ -205,8 +201,10 @@ def read_spheres(file: Path | str) -> SphereFile:
     columns = np.array(table).T
     for name, value in (("index", head[0]), ("thickness", head[2])):
         check_interval(f"{path.name}: {name}", value, 1e-6 if name == "thickness" else 1.0, 1e6)
+    if head[6] != 0:
+        raise ValueError(f"{path.name}: number of spheres must be 0, of corrected readings, got {head[6]:g}")
     slide = head[1] if head[3] > 0 else 1.0
-    return SphereFile(head[0], slide, head[2], int(head[6]), columns[0], dict(zip(kind, columns[1:])))
+    return SphereFile(head[0], slide, head[2], columns[0], dict(zip(kind, columns[1:])))
 
 
 def _lines(text: str) -> Iterator[tuple[int, str]]:

@@ -134,7 +134,8 @@ class Instrument:
     def __post_init__(self) -> None:
         for name in ("times", "depths"):
             if getattr(self, name) is not None:
-                object.__setattr__(self, name, check_edges(name, getattr(self, name)))
+                kind = "times >= 0 in ps" if name == "times" else "lengths >= 0 in mm"
+                object.__setattr__(self, name, check_edges(name, getattr(self, name), kind))
         check_interval("beam_radius", self.beam_radius, 0.0, 1e12)
         object.__setattr__(self, "detectors", tuple(self.detectors))
         for detector in self.detectors:
@@ -245,19 +246,17 @@ def _place(edges2: Lanes | None, event: Boundary | Scatter) -> Lanes | int:
 
 
 class Recorder:
-    """The tallies of an instrument for the passes of one trace, and what they found."""
+    """The tallies of an instrument for the passes of one trace of a beam, and what they found."""
 
     def __init__(
-        self, instrument: Instrument, types: ModuleType, medium: Medium, mu_i: float | str, radii: np.ndarray | None
+        self, instrument: Instrument, types: ModuleType, medium: Medium, mu_i: float, radii: np.ndarray | None
     ) -> None:
         self.instrument, self.types, self.medium, self.radii = instrument, types, medium, radii
         self.symmetric, self.sigma_t = mu_i == 1, float(medium.sigma_t)
-        if mu_i == "diffuse" and (instrument.detectors or instrument.beam_radius):
-            raise ValueError("detectors and beam_radius must be left out for diffuse light, which enters everywhere")
         if instrument.depths is not None and not medium.albedo > 0:
             raise ValueError("depths must be left out of a medium with albedo 0, where nothing scatters, got depths")
         sigma = 0.5 * instrument.beam_radius * self.sigma_t  # exp(-2 r² / w²) is normal with the deviation w/2
-        self.spot = (sigma / max(mu_i, 1e-6), sigma) if sigma else None
+        self.spot = (sigma / max(mu_i, 1e-6), sigma) if sigma > 0 else None
         self.parts: dict[str, list[np.ndarray]] = {}
 
     def tallies(self) -> list[Tally]:
@@ -304,9 +303,6 @@ class Readings:
     medium: Medium
     radii: np.ndarray | None
     _samples: dict[str, np.ndarray]
-
-    def __repr__(self) -> str:
-        return f"<Readings of {', '.join(self._samples) or 'nothing'}>"
 
     def reflectance_in_time(self) -> Estimate:
         """R(t) over each of `times`, all that leaves anywhere, 1/ps."""

@@ -149,7 +149,7 @@ def trace(
         directions: pairs (mu_o, delta_phi) for `angular_reflectance`; delta_phi = 0 is forward, the far
             side; not for diffuse light.
         radii: edges in mm of the rings for `exitance`, ascending.
-        instrument: records light in time, any absorption, fluence, fibres; of half-spaces.
+        instrument: records light in time, any absorption, fluence, fibres; of half-spaces, not for diffuse light.
         backend: "llvm" or "cuda".
         relative_error: stop early, at a pass of up to 8.4 million walks, once the standard error of the total
             reflectance has come down to this fraction of it.
@@ -176,8 +176,10 @@ def trace(
         check_interval("relative_error", relative_error, 0.0, 1.0)
     edges = checked_radii(radii, mu_i)
     pairs = _checked_directions(directions, mu_i)
+    if mu_i == "diffuse" and instrument is not None:
+        raise ValueError(f"instrument must be None for diffuse light, which is no beam, got {instrument!r}")
     types, started = array_types(backend), time.perf_counter()
-    recorder = Recorder(Instrument() if instrument is None else instrument, types, medium, mu_i, edges)
+    recorder = Recorder(instrument or Instrument(), types, medium, mu_i, edges)
 
     def tallies() -> list[Tally]:
         angular = [] if pairs is None else [AngularTally(types, medium.g, medium.eta, *pairs.T)]

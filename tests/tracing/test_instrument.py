@@ -87,6 +87,24 @@ def test_fluence_of_a_medium_that_hardly_scatters_is_the_beam():
     assert np.all(np.abs(z(found, (beam, 1e-3 * beam))) < 4)
 
 
+def test_fluence_is_that_of_discrete_ordinates():
+    nanodisort = pytest.importorskip("nanodisort")
+    state, depths = nanodisort.DisortState(), np.linspace(0.0, 8.0, 161)
+    state.nstr, state.nlyr, state.nmom, state.ntau = 64, 1, 200, len(depths)
+    state.usrtau = state.lamber = state.quiet = state.onlyfl = True
+    state.usrang = state.planck = state.intensity_correction = state.old_intensity_correction = False
+    state.fbeam, state.umu0, state.phi0, state.fisot, state.albedo = 1.0, 1.0, 0.0, 0.0, 0.0
+    state.allocate()
+    state.pmom = 0.5 ** np.arange(state.nmom + 1)[:, None]
+    state.dtauc, state.ssalb, state.utau = np.array([60.0]), np.array([0.9]), depths
+    state.solve()
+    phi = 4 * np.pi * np.asarray(state.uavg)
+    means = np.array([np.trapezoid(phi[k : k + 21], dx=0.05) for k in range(0, 160, 20)])
+    asked = Instrument(depths=depths[::20])
+    found = trace(Medium.from_albedo(0.9, 1.0, 0.5, 1.0), 1.0, 60_000, 10, instrument=asked).readings.fluence()
+    assert np.all(found.standard_error < 0.05 * found.value) and np.all(np.abs(z(found, (means, 2e-3 * means))) < 4)
+
+
 def test_mean_depth_of_one_scattering_event_is_exact():
     """Of e^-z E_2(z): the mean depth of isotropic single scattering, matched, is (∫ z e^-z E_2) / (∫ e^-z E_2)."""
     from scipy.special import expn
@@ -130,13 +148,13 @@ def test_an_instrument_leaves_the_walks_as_they_are(run):
 
 
 BAD = [
-    (lambda: Instrument(times=[1.0, 0.5]), "times must be"),
+    (lambda: Instrument(times=[1.0, 0.5]), "times must be two or more finite, ascending times >= 0 in ps"),
     (lambda: Instrument(detectors=[3]), "detectors must be Ring or Fibre, got 3"),
     (lambda: Instrument(beam_radius=-1.0), "beam_radius must be .* got -1"),
     (lambda: Ring(2.0, 1.0), "outer must be .* got 1"),
     (lambda: Fibre(0.0, 0.0), "radius must be .* got 0"),
     (lambda: Fibre(0.0, 1.0, 1.5), "numerical_aperture must be .* got 1.5"),
-    (lambda: trace(MEDIUM, "diffuse", 256, instrument=Instrument(beam_radius=1.0)), "beam_radius must be left out"),
+    (lambda: trace(MEDIUM, "diffuse", 256, instrument=Instrument()), "instrument must be None for diffuse light"),
     (lambda: trace(Medium(0.0, 1.0), 1.0, 256, instrument=Instrument(depths=[0, 1])), "depths must be left out"),
     (lambda: trace(Layers([MEDIUM]), 1.0, 256, instrument=Instrument()), "instrument must be left out for layers"),
 ]
