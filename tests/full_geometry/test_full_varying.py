@@ -33,7 +33,7 @@ pytestmark = pytest.mark.usefixtures("rgb")
 
 BUNNY = Path(__file__).parents[2] / "figures" / "assets" / "bunny.ply"
 QUICK = Recipe(width=32, depth=2, batch=1024, chunk=2**15, reuse=4)
-CHUNKS, PASSES = 8, 6
+CHUNKS, PASSES = 5, 6
 RNG = np.random.default_rng(3)
 DENSITY = 8.0 ** -RNG.random((4, 4, 4, 1))
 ALBEDO = 0.9 + 0.095 * RNG.random((4, 4, 4, 3))
