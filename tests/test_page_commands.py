@@ -1,4 +1,8 @@
-"""Every command of README.md and of docs/start.md runs for a new user: in the order of the page, in an empty home."""
+"""Every block of the pages for users runs: commands and Python, in the order of the page, in an empty home.
+
+All pages share one process, and so its kernels. A line of `LESS` shortens what would take minutes, and a line of
+`UNDERSTOOD` says what is only parsed, with the reason.
+"""
 
 from __future__ import annotations
 
@@ -8,28 +12,53 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
+from materials.test_looks import glb, mtlx
 
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).resolve().parent.parent
-LESS = {  # what a command is given beside, by its first words, as it would take minutes
+PAGES = ["README.md", *(f"docs/{name}.md" for name in (
+    "start", "materials", "curves", "tracing", "rendering", "light", "learnt_models", "inverse", "trade", "train",
+    "cluster", "plugins", "biomedical", "errors", "figures", "choosing", "add_model",
+))]  # fmt: skip
+LESS = {  # what a command is given beside, by the longest of these that it starts with
     "curves": "--paths 20000 --theta-i 0",
     "render": "--spp 2",
     "render scene.xml --model path_traced --target-error": "--target-error 0.5",
     "fit": "--steps 2 --spp 2",
     "train object": "--seconds 1",
-    "train material": "--channel R --steps 100",
-    "trade": "--assess 0.1",
+    "train material": "--steps 20",
+    "train material ketchup": "--channel R --steps 20",
+    "train material fig10 --model neural_paper": "--steps 20",
+    "trade scene.xml": "--assess 0.1",
+    "trade ball.xml": "--assess 0.1",
+    "trade scene.xml --train-seconds": "--assess 0.1 --train-seconds 1",
+    "errors materials": "--events 1e5 --channel R --model better_dipole",
+    "errors materials --held-out": "--events 1e5 --held-out 2",
+    "errors object": "--exits 16",
+    "errors truths": "--model better_dipole",
+    "maps": "--grid 2,16,6,4 --target-error 0.5",
+    "maps marble --channel G,B --paths": "--grid 2,16,6,4 --paths 2048",
+    "maps marble ketchup --workers": "--grid 2,16,6,4 --target-error 0.5 --workers 1",
+    "validate": "--quick --rows T0134",
+    "figures all fig09": "--quality draft",
+    "figures compute": "--quality draft",
+    "figures draw": "--quality draft",
 }
-FIGURE = "halfspace-sss figures"
-SMALLER = """
-from figures import fig09
-
-fig09.SHOWN, fig09.MODELS, fig09.SIZES = {"draft": ("ketchup",)}, ("better_dipole",), {"draft": 24}
-"""
+UNDERSTOOD = {  # by their beginnings, why
+    "train universal": "half an hour",
+    "train shapes": "an hour",
+    "figures all --quality draft": "15 minutes",
+    "figures all fig09 fig10 --scheduler": "a scheduler",
+    "maps marble ketchup --scheduler": "a scheduler",
+    "maps marble --scheduler": "a scheduler and a bucket",
+}
+HOME = ("XDG_", "HALFSPACE_SSS", "MPL")
 SCENE = """<scene version="3.0.0">
     <integrator type="bssrdf"/> <emitter type="constant"/>
     {shape}
@@ -39,77 +68,149 @@ SCENE = """<scene version="3.0.0">
     </sensor>
 </scene>
 """
+TEXTURE = """<texture name="albedo" type="bitmap"> <string name="filename" value="texels.pfm"/>
+    <boolean name="raw" value="true"/> </texture>"""
 RUN = """
+import contextlib
+import io
+import json
+import os
 import shlex
 import sys
+import time
 
+from figures import fig09
 from figures.command_line import main
 
-for line in sys.argv[1:]:
+fig09.SHOWN, fig09.MODELS, fig09.SIZES = {"draft": ("ketchup",)}, ("better_dipole",), {"draft": 24}
+
+
+def command(line):
     sys.argv = shlex.split(line)
     try:
         main()
     except SystemExit as end:
         if end.code:
-            raise SystemExit(f"{line}: exit code {end.code}")
-    print(f"ran: {line}", flush=True)
+            raise ValueError(f"exit code {end.code}") from None
+
+
+def python(text):
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        exec(compile(text, "block", "exec"), {"__name__": "__main__"})
+    if not printed.getvalue().strip():
+        raise ValueError("nothing is printed")
+
+
+for folder, kind, text in json.loads(sys.argv[1]):
+    os.chdir(folder)
+    start, error, told = time.process_time(), "", io.StringIO()
+    try:
+        with contextlib.redirect_stderr(told):
+            {"bash": command, "python": python}[kind](text)
+    except Exception as wrong:
+        error = f"{wrong!r}: {told.getvalue()[-2000:]}"
+    print("\\nRAN", json.dumps([folder, text, error, time.process_time() - start]), flush=True)
 """
 
 
-def _blocks(page: str, language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", (ROOT / page).read_text(encoding="utf-8"), flags=re.M | re.S)
+def _blocks(page: str) -> list[tuple[str, str]]:
+    return re.findall(r"^```(\w+)\n(.*?)^```", (ROOT / page).read_text(encoding="utf-8"), flags=re.M | re.S)
 
 
-def _commands(page: str) -> list[str]:
-    lines = [line.split("#")[0] for text in _blocks(page, "bash") for line in text.splitlines()]
-    return [part.strip() for line in lines for part in line.split("&&") if part.strip()]
+def _commands(text: str) -> list[str]:
+    parts = [part.strip() for line in text.splitlines() for part in line.split("#")[0].split("&&")]
+    return [part for part in parts if part.startswith("halfspace-sss ") or part == "halfspace-sss"]
 
 
-def _shortened(line: str) -> str:
+def _start(line: str, starts: dict[str, str]) -> str | None:
     words = line.removeprefix("halfspace-sss ")
-    return " ".join([line, *(more for start, more in LESS.items() if words.startswith(start))])
+    return max((start for start in starts if words.startswith(start)), key=len, default=None)
 
 
-def _run(lines: list[str], folder: Path, before: str = "") -> None:
-    """Run commands after the statements `before`."""
-    home = folder / "home"
-    home.mkdir()
-    kept = {k: v for k, v in os.environ.items() if not k.startswith(("XDG_", "HALFSPACE_SSS", "MPL"))}
+def _items(page: str) -> list[tuple[str, str]]:
+    """Kind and text of what runs, in the order of the page."""
+    found = []
+    for kind, text in _blocks(page):
+        found += [("python", text)] if kind == "python" else []
+        for line in _commands(text) if kind == "bash" else ():
+            if _start(line, UNDERSTOOD) is None:
+                start = _start(line, LESS)
+                found.append(("bash", line if start is None else f"{line} {LESS[start]}"))
+    return found
+
+
+def _pages(top: Path) -> Iterator[tuple[str, str, str]]:
+    """Folder, kind and text of all that runs; a command without a file runs where it stands first."""
+    ran = set()
+    for page in PAGES:
+        folder = top / Path(page).stem
+        folder.mkdir()
+        _lay_out(page, folder)
+        for kind, text in _items(page):
+            if text not in ran or ".xml" in text:
+                yield str(folder), kind, text
+            ran.add(text)
+
+
+def _of_kind(page: str, kind: str) -> str:
+    return next(text for language, text in _blocks(page) if language == kind)
+
+
+def _lay_out(page: str, folder: Path) -> None:
+    """The files that a page speaks of."""
+    mesh = _of_kind("README.md", "xml")
+    box = '<shape type="cube" id="bunny"> <transform name="to_world"> <scale value="10"/> </transform>'
+    scene = SCENE.format(shape=mesh if page == "README.md" else re.sub(r"<shape.*?/>", box, mesh, flags=re.S))
+    if page == "docs/start.md":
+        (folder / "ball.xml").write_text(_of_kind(page, "xml"))
+    elif page == "docs/materials.md":
+        mtlx(folder)
+        glb(folder)
+    elif page == "docs/inverse.md":
+        scene = _of_kind(page, "xml")
+        truth = scene.replace('name="albedo" value="0.8"', 'name="albedo" value="0.97, 0.93, 0.8"')
+        truth = truth.replace('name="sigma_t" value="1"', 'name="sigma_t" value="2, 2, 1.5"')
+        painted = re.sub(r'<string name="albedo" value="0.8"/>', TEXTURE, scene)
+        (folder / "truth.xml").write_text(truth)
+        (folder / "bust.xml").write_text(painted)
+        (folder / "texels.pfm").write_bytes(b"PF\n2 2\n-1.0\n" + np.full((2, 2, 3), 0.8, np.float32).tobytes())
+        (folder / "views.json").write_text(_of_kind(page, "json"))
+    else:
+        views = {"views": [{"image": "render/scene_path_traced.exr", "sensor": 0}]}
+        (folder / "views.json").write_text(json.dumps(views))
+        shutil.copy(ROOT / "figures" / "assets" / "bunny.ply", folder / "bunny.ply")
+    (folder / "scene.xml").write_text(scene)
+
+
+@pytest.fixture(scope="module")
+def wrong(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
+    """By page, what failed."""
+    top = tmp_path_factory.mktemp("pages")
+    items = list(_pages(top))
+    (top / "home").mkdir()
+    kept = {key: value for key, value in os.environ.items() if not key.startswith(HOME)}
     run = subprocess.run(
-        [sys.executable, "-c", before + RUN, *lines], cwd=folder, capture_output=True, text=True,
-        env={**kept, "HOME": str(home), "PYTHONPATH": os.pathsep.join(sys.path)},
+        [sys.executable, "-c", RUN, json.dumps(items)], capture_output=True, text=True,
+        env={**kept, "HOME": str(top / "home"), "PYTHONPATH": os.pathsep.join(sys.path)},
     )  # fmt: skip
-    assert run.returncode == 0, run.stderr
-    assert [f"ran: {line}" for line in lines] == re.findall(r"^ran: .*$", run.stdout, flags=re.M)
+    ran = [json.loads(line.removeprefix("RAN ")) for line in run.stdout.splitlines() if line.startswith("RAN ")]
+    assert [row[:2] for row in ran] == [[folder, text] for folder, _, text in items], run.stderr[-2000:]
+    if told := os.environ.get("HALFSPACE_SSS_PAGES"):
+        Path(told).write_text(json.dumps(ran, indent=1))
+    failed: dict[str, list[str]] = {Path(page).stem: [] for page in PAGES}
+    for folder, text, error, _ in ran:
+        failed[Path(folder).name] += [f"{text}: {error}"] if error else []
+    return failed
 
 
-def _readme_scene(folder: Path) -> None:
-    """The scene that README.md speaks of, about the shape that it shows, and the views of it."""
-    (shape,) = _blocks("README.md", "xml")
-    (folder / "scene.xml").write_text(SCENE.format(shape=shape))
-    shutil.copy(ROOT / "figures" / "assets" / "bunny.ply", folder / "bunny.ply")
-    views = {"views": [{"image": "render/scene_path_traced.exr", "sensor": 0}]}
-    (folder / "views.json").write_text(json.dumps(views))
+@pytest.mark.parametrize("page", PAGES)
+def test_every_block_of_a_page_runs(page: str, wrong: dict[str, list[str]]) -> None:
+    assert not wrong[Path(page).stem], "\n".join(wrong[Path(page).stem])
 
 
-def test_the_commands_of_the_first_five_minutes_run(tmp_path: Path) -> None:
-    (scene,) = _blocks("docs/start.md", "xml")
-    (tmp_path / "ball.xml").write_text(scene)
-    install, *lines = _commands("docs/start.md")
-    assert install.startswith("pip install ")
-    _run([_shortened(line) for line in lines], tmp_path)
-
-
-def test_the_commands_of_the_readme_run(tmp_path: Path) -> None:
-    _readme_scene(tmp_path)
-    lines = _commands("README.md")
-    others = [line for line in lines if not line.startswith("halfspace-sss ")]
-    assert all(line == "pytest" or line.startswith("pip install -c constraints.txt ") for line in others)
-    _run([_shortened(line) for line in lines if line not in others and not line.startswith(FIGURE)], tmp_path)
-
-
-def test_the_figure_of_the_readme_is_drawn(tmp_path: Path) -> None:
-    """Of one material by walks and a model, with few pixels; `test_fig09.py` knows others."""
-    lines = [line for line in _commands("README.md") if line.startswith(FIGURE)]
-    assert lines
-    _run(lines, tmp_path, SMALLER)
+@pytest.mark.parametrize("starts", [LESS, UNDERSTOOD])
+def test_every_line_of_the_tables_is_of_a_command(starts: dict[str, str]) -> None:
+    lines = [line for page in PAGES for kind, text in _blocks(page) if kind == "bash" for line in _commands(text)]
+    used = {_start(line, starts) for line in lines}
+    assert set(starts) <= used, set(starts) - used

@@ -38,7 +38,7 @@ class UntilOptions:
         int | None,
         typer.Option(help="Samples for each pixel.", parser=shared.whole, show_default="64, or another end"),
     ] = None
-    target_error: Annotated[float | None, typer.Option(help="Stop at this relative error of the image.")] = None
+    target_error: Annotated[float | None, typer.Option(help="Stop at this relative error; 0.02 is 2 %.")] = None
     seconds: Annotated[float | None, typer.Option(help="Stop after this time of rendering.")] = None
 
     def limits(self) -> Limits:
@@ -63,7 +63,8 @@ class TransportOptions:
     light: Annotated[
         str | None,
         typer.Option(
-            help="Models: sampled (no bias), gathered (little bias, no noise of orders from two on) or auto. "
+            help="Models: sampled (no bias), gathered (little bias, no noise of orders from two on), corrected "
+            "(gathered, less the bias of the model that walks find) or auto. "
             "path_traced: precomputed (bias below .3 %), sampled or auto.",
             show_default="models: sampled; path_traced: auto; or the scene's",
         ),

@@ -25,7 +25,7 @@ HEADINGS = ("technique", "bias, %", "variance", "s a million", "cost")
 class TradeOptions:
     """How good, how often, how soon."""
 
-    tolerance: Annotated[float, typer.Option(help="Relative error, bias and noise together.")] = 0.05
+    tolerance: Annotated[float, typer.Option(help="Relative error, bias and noise together: 0.05 is 5 %.")] = 0.05
     images: Annotated[int, typer.Option(help="Number of images to render.", parser=shared.whole)] = 1
     seconds: Annotated[float | None, typer.Option(help="Longest time of the whole job.", show_default="no limit")] = (
         None
@@ -68,7 +68,7 @@ def trade(
     from halfspace_sss.checks import check_count, check_interval
     from halfspace_sss.provenance import check_folder
 
-    check_interval("tolerance", wanted.tolerance, 1e-4, 10.0)
+    check_interval("tolerance", wanted.tolerance, 1e-4, 1.0)  # 5 is meant as 5 %
     check_count("images", wanted.images, 1)
     if what is None:
         _check_left_out("without a scene or a material", seconds=wanted.seconds, model=model, r=r, define=on.define)

@@ -202,8 +202,8 @@ def _class(variant: str) -> type:
 
         @property
         def gathered(self) -> list[str]:
-            """A sentence on the light that was gathered, and corrected, for each object, with its error."""
-            return self.gathering.told() + self.corrections.told()
+            """A sentence on the light that was gathered, or corrected, for each object, with its error."""
+            return self.corrections.told() or self.gathering.told()
 
         def to_string(self) -> str:
             return f"BSSRDFIntegrator[{self.settings}]"

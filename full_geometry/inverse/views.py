@@ -83,7 +83,7 @@ def read_views(path: str | Path) -> list[GivenView]:
     try:
         content = json.loads(read_text(path))
     except (OSError, ValueError) as error:
-        raise ValueError(f"{path}: must be JSON, got {error}") from error
+        raise ValueError(f"{path}: must be a readable JSON file, got {error}") from error
     if not isinstance(content, dict) or content.keys() != {"views"}:
         got = f"the keys {', '.join(content)}" if isinstance(content, dict) else f"a {type(content).__name__}"
         raise ValueError(f'{path}: must be an object {{"views": [...]}}, got {got}')

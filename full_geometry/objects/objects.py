@@ -388,7 +388,8 @@ def millimetres(scene: mi.Scene) -> float:
     if isinstance(integrator, KnowsUnit):
         return float(integrator.mm_per_unit)
     warnings.warn(
-        "a unit of the scene is taken for 1 mm: its integrator is not bssrdf or translucent_walk", stacklevel=3
+        "a unit of the scene is taken for 1 mm: mm_per_unit of an integrator bssrdf or translucent_walk changes that",
+        stacklevel=3,
     )
     return 1.0
 

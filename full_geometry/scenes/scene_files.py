@@ -18,7 +18,7 @@ from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.settings import LIGHTS, ORDERS, PATH_TRACED, SHARED, WALK_LIGHTS, check_variant
 from full_geometry.surface.wrapped import surface_of
 from full_geometry.transport.models import model_names, of_objects
-from halfspace_sss.checks import check_choice
+from halfspace_sss.checks import check_choice, did_you_mean
 from halfspace_sss.interrupts import is_interrupt
 
 if TYPE_CHECKING:
@@ -251,7 +251,8 @@ def parsed(scene: dict | str | Path, parameters: Mapping[str, str]) -> tuple[Par
     config = mi.parser.ParserConfig(mi.variant())
     config.parallel = False  # objects then have the same numbers each time, and kernels are found in Dr.Jit's cache
     if not isinstance(scene, dict) and not Path(scene).is_file():
-        raise ValueError(f"scene must be an XML file, got {str(scene)!r}, which is none")
+        near = did_you_mean(scene, map(str, Path(scene).parent.glob("*.xml")))
+        raise ValueError(f"scene must be an XML file, got {str(scene)!r}, which does not exist{near}")
     try:
         if isinstance(scene, dict):
             state = mi.parser.parse_dict(config, scene)

@@ -202,7 +202,7 @@ def _told(assessed: ObjectTrade, option: _Raw, best: _Raw, job: Job) -> Option:
         size = f"{assessed.mfp[0]:.3g} to {assessed.mfp[1]:.3g} mean free paths across"
         images = "an image" if job.images == 1 else f"{job.images} images"
         why = f"{row.way} is the cheapest that keeps {job.tolerance:.3g} ({size}): {off}, {images} in {_time(took)}"
-        why += f" with {int(spp)} samples a pixel" + _training(row)
+        why += f" with {int(spp)} {'sample' if spp == 1 else 'samples'} a pixel" + _training(row)
         why += f"; render {Technique.of(row.way).flags} --spp {int(spp)}"
     elif took < math.inf:
         over = job.seconds is not None and took > job.seconds

@@ -48,8 +48,20 @@ def tell_interrupt(error: BaseException) -> typer.Exit:
     return _end(f"interrupted; {detail or 'files that were being written are whole or absent'}", interrupts.exit_code)
 
 
-def _show_warning(message: Warning | str, *_: object) -> None:
-    typer.echo(f"warning: {' '.join(str(message).split())}", err=True)
+def _show_warnings() -> Callable[..., None]:
+    """What shows each warning once: scenes that are loaded again warn again."""
+    shown: set[str] = set()
+
+    def show(message: Warning | str, *_: object) -> None:
+        text = " ".join(str(message).split())
+        if text not in shown:
+            typer.echo(f"warning: {text}", err=True)
+        shown.add(text)
+
+    return show
+
+
+NO_NUMBER = ("Input should be a valid number, unable to parse string as a number", "must be a number, such as 0.02")
 
 
 class Commands(TyperGroup):
@@ -57,7 +69,7 @@ class Commands(TyperGroup):
 
     def invoke(self, ctx: typer.Context) -> object:
         with interrupts, warnings.catch_warnings():
-            warnings.showwarning = _show_warning
+            warnings.showwarning = _show_warnings()
             try:
                 return self._refuse_in_a_line(ctx)
             except BaseException as error:
@@ -74,7 +86,7 @@ class Commands(TyperGroup):
             interrupts.check()
             raise _end(f"error: {error}", 2) from error
         except typer.TyperException as error:
-            message = error.format_message().replace("Value error, ", "")
+            message = error.format_message().replace("Value error, ", "").replace(*NO_NUMBER)
             if not message:  # a group without a command has shown its help
                 raise
             raise _end(f"error: {message}", error.exit_code) from None

@@ -86,6 +86,7 @@ def test_a_store_of_other_parameters_is_refused_and_nothing_added(tmp_path: Path
         (["marble", "--albedo", "0.5"], "albedo must be left out for a named material, got 0.5"),
         (["marble", "--name", "a"], "name must be left out unless coefficients are given, got 'a'"),
         (["--g", "0", "--name", "a/b"], "usable as a file name, got 'a/b'"),
+        (["--sigma-t", "two"], "Invalid value for '--sigma-t': must be a number, such as 0.02"),
         (["--sigma-t", "-2"], "sigma_t must be finite and > 0 (1/mm), got -2"),
         (["--grid", "16,64"], "grid must be four whole numbers separated by commas, got '16,64'"),
         (["--grid", "16,64,inf,8"], "grid must be four whole numbers separated by commas, got '16,64,inf,8'"),

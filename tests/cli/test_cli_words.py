@@ -146,9 +146,10 @@ def test_a_material_stands_for_its_medium() -> None:
     assert result.title == "marble G" and result.medium == materials.load("marble").medium.channel(1)
 
 
-def test_a_warning_is_one_line_without_source(monkeypatch: Any) -> None:
+def test_a_warning_is_one_line_without_source_and_shown_once(monkeypatch: Any) -> None:
     def table() -> Any:
-        warnings.warn("the object is\n not closed", stacklevel=2)
+        for _ in range(2):
+            warnings.warn("the object is\n not closed", stacklevel=2)
         raise ValueError("enough")
 
     monkeypatch.setattr(materials, "table", table)

@@ -211,7 +211,8 @@ def test_a_disk_that_fills_up_leaves_no_half_weights_and_work_to_go_on_from(monk
 TRAIN_BALL = ("train", "object", "--scene", "ball.xml")
 ERRORS = ("errors", "object", "--scene", "ball.xml")
 REFUSED = [
-    (["train", "object", "--scene", "no.xml"], "scene must be an XML file, got 'no.xml'"),
+    (["train", "object", "--scene", "bal.xml"], "got 'bal.xml', which does not exist; did you mean 'ball.xml'?"),
+    (["trade", "ball.xml", "--tolerance", "5"], "tolerance must be a number in [0.0001, 1], got 5.0"),
     ([*TRAIN_BALL, "--object", "cube"], "object must be one of ball, got 'cube'"),
     (["train", "object", "--scene", "two.xml"], "object must be one of ball, other, got None"),
     ([*TRAIN_BALL, "--seconds", "-1"], "seconds must be a number in [0, 1e+07], got -1.0"),

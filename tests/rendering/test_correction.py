@@ -117,7 +117,7 @@ def test_it_has_the_mean_of_walks_within_1_percent_where_the_model_is_5_percent_
     gathered = _image(_scene("gathered", MEDIUM, _lamp()), 256).mean(axis=(0, 1))
     assert np.abs(gathered / walked - 1).max() > 0.05
     assert (np.abs(corrected / walked - 1) < 0.01 + 4 * error / walked).all()
-    assert "corrected by 131072 walks" in scene.integrator().gathered[1]
+    assert "corrected by 131072 walks" in scene.integrator().gathered[0]
 
 
 def test_walks_are_added_for_an_image_of_more_samples_and_kept_for_one_of_fewer() -> None:
