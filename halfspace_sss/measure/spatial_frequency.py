@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from halfspace_sss.interface.model import BSSRDF
-from halfspace_sss.measure.quadrature import Angles, distances
+from halfspace_sss.measure.quadrature import Angles, Quadrature, distances
 from halfspace_sss.measure.reflected_flux import DEFAULT, Integral, check_order
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.medium import Medium, check_scalar_medium
@@ -33,13 +33,17 @@ class ReducedCoefficients(NamedTuple):
     sigma_s_prime: Integral
 
 
-def frequency_reflectance(model: BSSRDF, frequencies: Sequence[float], order: str | None = None) -> np.ndarray:
+def frequency_reflectance(
+    model: BSSRDF, frequencies: Sequence[float], order: str | None = None, quadrature: Quadrature = DEFAULT
+) -> np.ndarray:
     """R(f) of any half-space model for light along the normal.
 
     Args:
         model: of a scalar medium.
         frequencies: spatial frequencies, 1/mm, >= 0.
         order: as in `measure.reflectance`; "total" adds the exact single order.
+        quadrature: of directions. Where S depends on both azimuths, as in networks, the default takes tens of seconds;
+            `Quadrature(n_azimuth=8, n_mu=6)` takes 0.6 a frequency and is 1 % low for `neural` at albedo 0.95.
 
     Raises:
         ValueError: a frequency is out of range, the medium has channels, or the model cannot form the order.
@@ -48,8 +52,8 @@ def frequency_reflectance(model: BSSRDF, frequencies: Sequence[float], order: st
 
     check_order(model, order)
     check_scalar_medium(model.medium)
-    angles, result = Angles(model.eval, model.medium, DEFAULT), []
-    range_of = distances(angles, 1.0, DEFAULT)[[0, -1]]
+    angles, result = Angles(model.eval, model.medium, quadrature), []
+    range_of = distances(angles, 1.0, quadrature)[[0, -1]]
     for f in checked_frequencies(frequencies):
         k = 2 * math.pi * f
         r, w, n = _nodes(*range_of, k)
