@@ -34,5 +34,6 @@ def view(
         shared.say(f"{page.url}  (Ctrl-C ends)")
         while not threading.Event().wait(0.2):
             interrupts.check()
+            page.check()
     finally:
         page.close()

@@ -11,7 +11,7 @@ import numpy as np
 
 from full_geometry.scenes.scene_files import references
 from full_geometry.settings import PATH_TRACED
-from full_geometry.surface.translucent import COEFFICIENTS
+from full_geometry.surface.translucent import COEFFICIENTS, ETA
 from halfspace_sss import materials
 
 if TYPE_CHECKING:
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 RADIANCES = ("radiance", "irradiance", "intensity", "power")
 SCALES = {"envmap": ("scale",), "sunsky": ("sun_scale", "sky_scale"), "sky": ("sky_scale",)}
 OF_MEDIA = (*COEFFICIENTS, "material", "dilution", "channel")
-EVERYWHERE_ALIKE = "constant"  # an emitter that cannot be turned
 
 
 @dataclass(frozen=True)
@@ -128,7 +127,7 @@ def _change_light(state: ParserState, edits: Edits, turned: mi.ScalarAffineTrans
         lamp = node.type == mi.ObjectType.Shape and any(
             state.nodes[k].props.plugin_name() == "area" for k in references(props).values()
         )
-        if moves and (lamp or emits and kind not in ("area", EVERYWHERE_ALIKE)):
+        if moves and (lamp or emits and kind not in ("area", "constant")):
             key = next((key for key in ("position", "direction") if key in props and emits), "to_world")
             old = props[key] if key in props else mi.ScalarAffineTransform4d()
             of = {"position": mi.ScalarPoint3d, "direction": mi.ScalarVector3d}.get(key, lambda v: v)
@@ -166,7 +165,8 @@ def _fill(state: ParserState, props: mi.Properties, medium: Mapping[str, Any]) -
         if state.nodes[props[key].index()].type == mi.ObjectType.BSDF:
             del props[key]
     if alpha > 0:
-        eta = float(np.max(materials.load(medium["material"]).medium.eta)) if "material" in medium else medium["eta"]
+        name, eta = (props[key] if key in props else None for key in ("material", "eta"))
+        eta = materials.load(name).medium.eta if name else ETA if eta is None else eta
         rough = mi.Properties("roughdielectric")
         rough["alpha"], rough["int_ior"], rough["ext_ior"] = float(alpha), float(eta), 1.0
         props["boundary"] = added(state, rough, mi.ObjectType.BSDF)
@@ -202,18 +202,13 @@ def put_integrator(state: ParserState, plugin: Mapping[str, Any]) -> None:
 
 def put_camera(state: ParserState, camera: Camera) -> None:
     """Let the first sensor of a scene stand and look as a camera; its film and its sampler stay but for the size."""
-    sensor = next((node.props for node in state.nodes if node.type == mi.ObjectType.Sensor), None)
-    if sensor is None:
-        raise ValueError("the scene must have a sensor to be saved with a camera, got none")
-    kept = {key for key in sensor.keys() if key in references(sensor)}
-    for key in set(sensor.keys()) - kept:
+    sensor = next(node.props for node in state.nodes if node.type == mi.ObjectType.Sensor)
+    for key in set(sensor.keys()) - set(references(sensor)):
         del sensor[key]
     sensor.set_plugin_name("perspective")
     sensor["to_world"] = mi.ScalarAffineTransform4d(np.asarray(camera.to_world, dtype=np.float64))
     sensor["fov"], sensor["fov_axis"] = float(camera.fov), "y"
-    films = [state.nodes[k].props for k in references(sensor).values() if state.nodes[k].type == mi.ObjectType.Film]
-    for film in films:
-        for key in ("crop_offset_x", "crop_offset_y", "crop_width", "crop_height"):
-            if key in film:
-                del film[key]
-        film["width"], film["height"] = camera.width, camera.height
+    for film in [state.nodes[k] for k in references(sensor).values() if state.nodes[k].type == mi.ObjectType.Film]:
+        for key in [key for key in film.props.keys() if key.startswith("crop_")]:
+            del film.props[key]
+        film.props["width"], film.props["height"] = camera.width, camera.height

@@ -17,6 +17,7 @@ from full_geometry.geometry.sensors import seeded
 from full_geometry.geometry.snapshot import differing
 from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.objects.objects import translucent_shapes
+from full_geometry.scenes.reference import check_sensor
 from full_geometry.scenes.reference_store import Reference, finite_pixels
 from full_geometry.scenes.scene_files import first_cause, open_scene, parsed
 from full_geometry.settings import OF_MITSUBA, PATH_TRACED, SHARED
@@ -74,8 +75,12 @@ class LiveScene:
         scene: the path of an XML file, or a dict as for `mitsuba.load_dict`.
         parameters: values of the parameters $name of an XML file.
 
+    Attributes:
+        up: the axis of the world that is up for the first sensor.
+        centre: the middle of all objects.
+
     Raises:
-        ValueError: as `open_scene`.
+        ValueError: as `open_scene`, or the scene has no sensor.
     """
 
     def __init__(self, scene: dict | str | Path, parameters: Mapping[str, str] | None = None) -> None:
@@ -83,8 +88,13 @@ class LiveScene:
         self.file = None if isinstance(scene, dict) else Path(scene).resolve()
         self.folder = Path.cwd() if self.file is None else self.file.parent
         self.edits, self._integrators = Edits(), {}
-        self._turning: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         self.scene = self._open(self.edits)
+        check_sensor(self.scene, 0)
+        up = np.array(self.camera(1).to_world)[:3, 1]
+        axis, boxes = np.argmax(np.abs(up)), [shape.bbox() for shape in translucent_shapes(self.scene)]
+        self.up = np.eye(3)[axis] * np.sign(up[axis])
+        low, high = (np.array([np.array(end) for end in ends]) for ends in zip(*((box.min, box.max) for box in boxes)))
+        self.centre = (low.min(axis=0) + high.max(axis=0)) / 2
         state, _ = parsed(scene, self._parameters)
         props = integrator_props(state)
         given = {} if props is None else {key: props[key] for key in props.keys() if key not in OF_MITSUBA}
@@ -114,11 +124,7 @@ class LiveScene:
         return dict(zip(self.names, found))
 
     def camera(self, pixels: int) -> Camera:
-        """That of the first sensor, with about so many pixels; before the objects where there is none."""
-        if not self.scene.sensors():
-            _, centre, size = self._frame()
-            pose = mi.ScalarTransform4f().look_at(list(centre + [0, 0, 3 * size]), list(centre), [0, 1, 0])
-            return Camera(_rows(pose.matrix), 40.0, math.isqrt(pixels), math.isqrt(pixels))
+        """That of the first sensor, with about so many pixels."""
         sensor = self.scene.sensors()[0]
         width, height = (int(v) for v in sensor.film().crop_size())
         parameters = mi.traverse(sensor)
@@ -163,36 +169,11 @@ class LiveScene:
         _put(scene, mi.traverse(scene), _of_light(scene))
         return scene
 
-    def _frame(self) -> tuple[np.ndarray, np.ndarray, float]:
-        """The vertical by the first sensor, the middle of all objects, and half their size, as the file has them."""
-        if self._turning is None:
-            sensors = self.scene.sensors()
-            up = np.array(sensors[0].world_transform().matrix).reshape(4, 4)[:3, 1] if sensors else np.eye(3)[1]
-            axis = np.eye(3)[np.argmax(np.abs(up))] * np.sign(up[np.argmax(np.abs(up))])
-            boxes = [shape.bbox() for shape in translucent_shapes(self.scene)]
-            low = np.min([np.array(box.min) for box in boxes], axis=0)
-            high = np.max([np.array(box.max) for box in boxes], axis=0)
-            self._turning = axis, (low + high) / 2, float(np.max(high - low)) / 2
-        return self._turning
-
-    @property
-    def up(self) -> np.ndarray:
-        """The axis of the world that is up for the first sensor."""
-        return self._frame()[0]
-
-    @property
-    def centre(self) -> np.ndarray:
-        """The middle of all objects."""
-        return self._frame()[1]
-
     def _turned(self, edits: Edits) -> np.ndarray:
         """The transformation of all light."""
-        up, centre, _ = self._frame()
-        across = np.roll(up, 1)
-        move = mi.ScalarAffineTransform4d().translate(centre)
-        move = move @ mi.ScalarAffineTransform4d().rotate(up, edits.turn)
-        move = move @ mi.ScalarAffineTransform4d().rotate(across, edits.tilt)
-        return np.array((move @ mi.ScalarAffineTransform4d().translate(-centre)).matrix)
+        T = mi.ScalarAffineTransform4d
+        turn = T().rotate(self.up, edits.turn) @ T().rotate(np.roll(self.up, 1), edits.tilt)
+        return np.array((T().translate(self.centre) @ turn @ T().translate(-self.centre)).matrix)
 
     def save(self, name: str, way: Way, camera: Camera, edits: Edits) -> str:
         """Write the scene as it is into its folder, as a new file or over one that `save` has written.
@@ -239,15 +220,16 @@ class LiveScene:
         started, integrator, guide = time.perf_counter(), self.integrator(way), None
         coarse = _pass(self.scene, integrator, camera.sensor(COARSE), seed, 1)
         ready = time.perf_counter() - started
-        told = tuple(integrator.gathered) if is_bssrdf(integrator) else ()
         rows, columns = (np.arange(n) * m // n for n, m in zip((camera.height, camera.width), coarse.shape))
-        yield Shown(coarse[rows][:, columns, :3], 0, math.inf, ready, ready, told)
-        sensor, mean, spp, last = camera.sensor(), None, 1, 0.0
+        yield Shown(coarse[rows][:, columns, :3], 0, math.inf, ready, ready, ())
+        sensor, mean, spp, told = camera.sensor(), None, 1, None
         while mean is None or mean.spp < MOST:
             begun = time.perf_counter()
             image = _pass(self.scene, integrator, sensor, seeded(seed, mean.passes if mean else 0), spp)
             last = time.perf_counter() - begun
             mean = (mean or Reference.empty(image.shape, {})).add(image, spp, last)
+            if told is None:
+                told = tuple(integrator.gathered) if is_bssrdf(integrator) else ()
             shown = mean.mean[..., :3]
             if way.denoise:
                 guide = guide or guides(self.scene, sensor, GUIDE_SPP)

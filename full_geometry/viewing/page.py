@@ -73,9 +73,9 @@ class Page:
         with _guarded(self.token, f"halfspace_sss_{port}"):
             self.server = viser.ViserServer(host, port, label="halfspace-sss", verbose=False)
         self.server.request_share_url = lambda verbose=True: None  # no tunnel to the world
-        shown = "localhost" if host in LOOPBACK else host
+        shown = "localhost" if host in LOOPBACK else socket.gethostname() if host in ("0.0.0.0", "::") else host
         self.url = f"http://{shown}:{self.server.get_port()}/" + (f"?token={self.token}" if self.token else "")
-        self._changed, self._stopped = threading.Condition(), False
+        self._woken, self._stopped = threading.Event(), False
         self._controls = Controls.of(self.server.gui, self.live, self._wake, self._saved)
         self._screens: dict[int, tuple[Any, Screen, Any]] = {}
         self._look()
@@ -89,6 +89,11 @@ class Page:
         self._wake(stopped=True)
         self._thread.join()
         self.server.stop()
+
+    def check(self) -> None:
+        """BackendError if the thread has ended, by an error that it has shown."""
+        if not self._thread.is_alive():
+            raise BackendError("the page shows no more images, for the reason above")
 
     def _repr_html_(self) -> str:
         return f'<iframe src="{self.url}" width="100%" height="600"></iframe>'
@@ -116,9 +121,8 @@ class Page:
         self._wake()
 
     def _wake(self, stopped: bool = False) -> None:
-        with self._changed:
-            self._stopped |= stopped
-            self._changed.notify_all()
+        self._stopped |= stopped
+        self._woken.set()
 
     def _saved(self, name: str, client: viser.ClientHandle) -> str:
         wish = self._wish(client)
@@ -139,12 +143,11 @@ class Page:
 
     def _work(self) -> None:
         while not self._stopped:
+            self._woken.clear()
             if self.live.stale():
                 self._reload()
-            busy = [self._serve(*each) for each in list(self._screens.values())]
-            with self._changed:
-                if not (any(busy) or self._stopped):
-                    self._changed.wait(PATIENCE)
+            if not any([self._serve(*each) for each in list(self._screens.values())]):
+                self._woken.wait(PATIENCE)
 
     def _serve(self, client: viser.ClientHandle, screen: Screen, told: viser.GuiMarkdownHandle) -> bool:
         """Send one more image to a browser; whether there is more to come."""

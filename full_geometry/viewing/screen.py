@@ -55,7 +55,7 @@ class Screen:
                     ways = [wish.way, *([Way(PATH_TRACED, "auto", wish.way.denoise)] if wish.compare else [])]
                     self._runs = [live.passes(wish.camera, way) for way in ways]
                     self._shown = [None] * len(ways)
-                elif not self._advances() and before == wish:
+                elif not self._runs and before == wish:
                     return None
                 self._advance()
         except KeyboardInterrupt:
@@ -65,9 +65,6 @@ class Screen:
             self._runs = []
             return None, f"**{' '.join(str(error).split())}**"
         return self._picture(wish)
-
-    def _advances(self) -> bool:
-        return bool(self._runs)
 
     def _advance(self) -> None:
         """A pass of the image that has had less time."""

@@ -19,6 +19,7 @@ import psutil
 import pytest
 from browser import chromium
 
+from full_geometry.surface.translucent import check_eta, is_rough
 from full_geometry.viewing.edits import Camera, Edits, Way
 from full_geometry.viewing.live import LiveScene, Shown
 from full_geometry.viewing.page import check_port, free_port, refusal
@@ -90,6 +91,16 @@ def test_images_are_those_of_the_scene_that_is_saved(live: LiveScene, edits: Edi
     np.testing.assert_allclose(found.image, wanted.image, rtol=1e-3, atol=1e-4)
     assert np.abs(found.image - plain.image).mean() > 1e-2
     assert found.spp == 2 and 0 < found.error < 1
+
+
+@pytest.mark.parametrize("medium", [{}, OWN, {"material": "ketchup"}], ids=["own", "numbers", "material"])
+def test_a_rough_boundary_has_the_index_of_its_medium(live: LiveScene, medium: dict[str, Any]) -> None:
+    live.apply(Edits(media={"ball": {**medium, "roughness": 0.2}}))
+    live.save("rough.xml", live.way, live.camera(64), live.edits)
+    for each in (live, LiveScene(live.folder / "rough.xml")):
+        boundary = each.scene.shapes()[0].bsdf().boundary
+        assert is_rough(boundary) and float(mi.traverse(boundary)["alpha.value"][0]) == pytest.approx(0.2)
+        check_eta(boundary, each.medium(each.names[0]).eta)
 
 
 def test_a_screen_shows_passes_begins_anew_and_ends_early(live: LiveScene) -> None:
