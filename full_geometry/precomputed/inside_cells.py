@@ -1,16 +1,21 @@
-"""The inside of an object on a grid of cubes, with the moments of the part of each cube that is inside.
+"""The inside of an object near its surface, in cubes, with the moments of the part of each cube that is inside.
 
-A cube of edge h that the surface cuts holds a part of the inside only. A function on the cells that is linear in each,
-least squares over the inside, needs the moments of that part,
+Light that has not scattered reaches a few mean free paths deep. Bricks of 4³ cells of edge h are therefore kept where
+the surface is nearer than that, and a table of all bricks tells which: an object of hundreds of mean free paths has as
+many cells as its surface is large. Bricks beyond the first few mean free paths have 2³ cells of edge 2 h.
+
+A cell that the surface cuts holds a part of the inside only. A function on the cells that is linear in each, least
+squares over the inside, needs the moments of that part,
 
     m_jk = ∫_inside x_j x_k dx / h³,    x = (1, x, y, z),
 
-x from the centre of the cell in units of h. Cells whose part is too small for a fit of their own share that of a
+x from the centre of the cell in units of its edge. Cells whose part is too small for a fit of their own share that of a
 neighbour.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import drjit as dr
@@ -22,13 +27,54 @@ from full_geometry.geometry.points import EntrySample, opaque
 from full_geometry.walk.media import WalkMedia
 from halfspace_sss.tracing.walk import generator, pass_seed
 
-MOST_CELLS = 2**23  # of the grid: h grows until it has no more
-POINTS = 24  # of the surface, for each h² of it, that find the cells it cuts
-MARGIN = 0.25  # of h, by which such a point reaches into the next cells
-COLUMNS = 7  # along each edge of a cell: COLUMNS² measure its inside
+BRICK = 4  # cells along its edge: its 64 cells are the bits of a number
+MOST_BRICKS, MOST_SLOTS = 2**24, 5 * 2**18  # of one object: h grows until it has no more
+POINTS = 6, 24  # of the surface, for each h² of it, that find the bricks and the cells it cuts
+MARGIN = 0.25  # of h, by which a point of the surface reaches into the next cells
+COLUMNS = 7, 4  # along each edge of a cell: their square measures its inside; the latter of FINE cells and more
+FINE, AT_ONCE = 2**15, 2**14
 SMALLEST = 0.25  # part of a cell, below which it shares the fit of a neighbour
 RIDGE = 0.02  # of the variance of a whole cell, added to that of the inside: slopes of a sliver are unknown
 PAIRS = ((0, 0), (0, 1), (0, 2), (0, 3), (1, 1), (2, 2), (3, 3), (1, 2), (1, 3), (2, 3))  # of the moments
+SurfaceParts = Callable[[float], Iterator[EntrySample]]
+PLACES = [np.arange(BRICK**3) // BRICK**a % BRICK for a in range(3)]  # of the cells of a brick along x, y, z
+
+
+@dataclass(frozen=True, eq=False)
+class CellIndex:
+    """Which cell holds a point.
+
+    Args:
+        brick: of each brick twice the place of its cells in `slot`, one more where they are coarse; -1 without cells.
+        slot: of each cell of these bricks its number among those that hold a part of the inside, or -1.
+    """
+
+    brick: mi.Int32
+    slot: mi.Int32
+
+    def find(
+        self, x: mi.Point3f, first: mi.Int32, counts: mi.Vector3i, active: mi.Bool | bool = True
+    ) -> tuple[mi.Int32, mi.Vector3f, mi.Float, mi.Bool]:
+        """Slot, place from the centre of the cell in units of its edge, 1 / edge, and whether there is a cell.
+
+        Args:
+            x: points from the corner of a grid, in units of h.
+            first: number of its first brick.
+            counts: of bricks along its axes.
+        """
+        # ---- the brick
+        whole = mi.Vector3i(dr.floor(x / BRICK))
+        held = active & dr.all((whole >= 0) & (whole < counts))
+        entry = dr.gather(mi.Int32, self.brick, first + (whole.z * counts.y + whole.y) * counts.x + whole.x, held)
+        held &= entry >= 0
+
+        # ---- the cell in it, whose edge is 1 or 2
+        coarse = (entry & 1) == 1
+        n, scale = dr.select(coarse, mi.Int32(BRICK // 2), BRICK), dr.select(coarse, mi.Float(0.5), 1)
+        y = (x - BRICK * mi.Vector3f(whole)) * scale
+        cell = dr.clip(mi.Vector3i(y), 0, n - 1)
+        slot = dr.gather(mi.Int32, self.slot, (entry >> 1) + (cell.z * n + cell.y) * n + cell.x, held)
+        return slot, mi.Vector3f(y) - (mi.Vector3f(cell) + 0.5), scale, held & (slot >= 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,113 +84,261 @@ class InsideCells:
     Args:
         low: corner of the grid, scene units.
         h: edge of a cell, scene units.
-        counts: cells along each axis.
-        slot: of each cell its place among those that hold a part of the inside, -1 of the others.
-        slots: number of the cells that hold one.
+        counts: bricks along each axis.
+        index: of the cells; `first` of the grid is 0.
+        slots: number of the cells that hold a part of the inside.
         cut: (cut,) slots of the cells that the surface cuts; all others are whole.
         place: (cut,) of each of them the place in `cut` of the cell whose fit it shares, its own for most.
-        offset: (cut, 3) its centre from that of this cell, in units of h.
-        moments: (cut, 4, 4) m_jk of its inside, about its centre.
+        offset: of each its centre from that of this cell, in units of h.
+        solve: (cut, 4, 4) in a row, coefficients of its fit from the moments ∫ f x_j dx / h³ of all that share it.
     """
 
     low: np.ndarray
     h: float
     counts: np.ndarray
-    slot: mi.Int32
+    index: CellIndex
     slots: int
-    cut: np.ndarray
-    place: np.ndarray
-    offset: np.ndarray
-    moments: np.ndarray
+    cut: mi.UInt32
+    place: mi.UInt32
+    offset: mi.Vector3f
+    solve: mi.Float
 
     @classmethod
     def of(
-        cls, media: WalkMedia, k: int, points: EntrySample, box: tuple[np.ndarray, np.ndarray], h: float, depth: float
-    ) -> InsideCells:
+        cls, media: WalkMedia, k: int, points: SurfaceParts, box: tuple[np.ndarray, np.ndarray], h: float,
+        depths: tuple[float, float],
+    ) -> InsideCells:  # fmt: skip
         """The cells of object k.
 
         Args:
             media: the objects.
             k: number of the object.
-            points: uniform over its surface, at least POINTS for each h².
+            points: so many uniform over its surface for each square of a scene unit, part by part.
             box: its least and largest coordinates.
-            h: edge of a cell; larger where the grid would have more than MOST_CELLS.
-            depth: below the surface, beyond which cells hold nothing, scene units.
+            h: edge of a cell, from `cell_edge`.
+            depths: below the surface, beyond which cells are coarse, and beyond which there are none, scene units.
         """
-        h = grid_edge(box, h)
-        # lay the grid around the box, with an empty rim
-        counts = np.ceil((box[1] - box[0]) / h + 2 * MARGIN).astype(int) + 2
-        low = 0.5 * (box[0] + box[1]) - 0.5 * counts * h
-        axes = _crossed(points, low, h, counts)
-        cut = axes >= 0
+        # ---- bricks that the surface cuts and those near them, and cells of the former that it cuts
+        counts = brick_counts(box, h)
+        low = 0.5 * (box[0] + box[1]) - 0.5 * BRICK * counts * h
+        surface = _crossed_bricks(points, low, h, counts)
+        bricks = np.flatnonzero(surface)
+        axes = _crossed_cells(points, low, h, counts, bricks)
+        apart = distance_transform_cdt(~surface.reshape(counts[::-1]), "chessboard").ravel()
+        near, far = (np.ceil(min(depth / (BRICK * h), 1e6)) for depth in depths)
 
-        # cells between cut ones are inside or outside all together: a ray from one of them tells
-        parts, n = label(~cut.reshape(counts[::-1]))
-        parts, one = parts.ravel(), np.zeros(n + 1, dtype=int)
-        one[parts] = np.arange(len(parts))
-        whole = _starts_inside(media, k, _centres(one, low, h, counts))
-        whole[0] = False  # the cut ones
-        inside = whole[parts]
+        # ---- what of them is inside; of the cut cells by measurement
+        inside, whole = _inside(media, k, (surface, bricks, axes >= 0), low, h, counts)
+        whole &= apart <= far
+        row, bit = np.nonzero(axes >= 0)
+        cells = _cells_of(bricks[row], bit, counts)
+        moments = _measure(media, k, _points(cells + 0.5, low, h), axes[row, bit], h)
+        row, bit, cells, moments = (v[moments[:, 0, 0] > 1e-6] for v in (row, bit, cells, moments))
+        inside[row, bit] = True
 
-        # measure the inside of the cut cells, and drop those that hold none of it
-        cells = np.flatnonzero(cut)
-        moments = _measure(media, k, cells, axes[cells], low, h, counts)
-        kept = moments[:, 0, 0] > 1e-6
-        cells, moments = cells[kept], moments[kept]
-
-        # whole cells within the depth that light reaches
-        if inside.any():
-            apart = distance_transform_cdt(~cut.reshape(counts[::-1]), "chessboard").ravel()
-            inside &= (apart - 1) * h < depth
-
-        # number the cells that hold a part of the inside
-        inside[cells] = True
-        held = np.flatnonzero(inside)
-        slot = np.full(counts.prod(), -1, dtype=np.int32)
-        slot[held] = np.arange(len(held))
-        place, offset = _parents(cells, moments[:, 0, 0], counts)
+        # ---- number them, and fit the cut ones
+        used = inside.any(axis=1)
+        fine = whole & (apart <= near)
+        fine[bricks[used]] = True
+        fine, coarse = np.flatnonzero(fine), np.flatnonzero(whole & (apart > near))
+        held = np.ones((len(fine), BRICK**3), dtype=bool)
+        at = np.searchsorted(fine, bricks)
+        held[at[used]] = inside[used]
+        index, slot, slots = _numbered(held, fine, coarse, len(surface))
+        place, offset = _parents(cells, moments[:, 0, 0], BRICK * counts)
         return cls(
-            low=low, h=h, counts=counts, slot=mi.Int32(slot), slots=len(held), cut=slot[cells], place=place,
-            offset=offset, moments=moments,
+            low=low, h=h, counts=counts, index=index, slots=slots, cut=mi.UInt32(slot[at[row], bit]),
+            place=mi.UInt32(place), offset=mi.Vector3f(offset.T),
+            solve=mi.Float(_solutions(moments, place, offset).ravel()),
         )  # fmt: skip
 
-    def fit(self, D: np.ndarray) -> np.ndarray:
-        """The fit of least squares over the inside: the value at the centre of each cell and its slopes by units of h.
+    def share(self, sums: mi.Float, n: int, moments: bool = False) -> None:
+        """Give cells that share a fit the sum over all of them.
 
         Args:
-            D: (slots, channels, 4) ∫ f x_j dx / h³ over the inside of each cell, x about its centre.
-
-        Returns:
-            Coefficients of 1, x, y, z, of the same shape.
+            sums: (slots, n) in a row, of each cell; changed in place.
+            n: numbers of a cell, fours.
+            moments: whether these are ∫ f (1, x, y, z) dx about the centre of each; the sums are about that of the cell
+                whose fit is shared.
         """
-        # ---- whole cells: the mean, and slopes by the variance 1/12
-        result = D * np.array([1, *[12 / (1 + RIDGE)] * 3], dtype=D.dtype)
+        for first in range(0, n, 4):
+            # ---- four sums by the cell whose fit is shared, moments about the centre of that
+            rows = [dr.gather(mi.Float, sums, self.cut * n + first + i) for i in range(4)]
+            if moments:
+                rows[1:] = (row + by * rows[0] for row, by in zip(rows[1:], self.offset))
+            total = [dr.zeros(mi.Float, dr.width(self.cut)) for _ in rows]
+            for target, row in zip(total, rows):
+                dr.scatter_add(target, row, self.place)
+            dr.eval(total)
+            del rows, row  # which read the sums: they would be copied
 
-        # ---- sums over the cells that share a fit, about the centre of their parent
-        rows, parent, offset = self.cut, self.place, self.offset
-        shift = np.tile(np.eye(4), (len(rows), 1, 1))
-        shift[:, 1:, 0] = offset
-        M, b = shift @ self.moments @ shift.transpose(0, 2, 1), np.einsum("sij,scj->sci", shift, D[rows])
-        M, b = (_added(values, parent) for values in (M, b))
+            # ---- given back to each
+            for i, target in enumerate(total):
+                dr.scatter(sums, dr.gather(mi.Float, target, self.place), self.cut * n + first + i)
+            dr.eval(sums)
 
-        # ---- the mean, and slopes about the centroid
+    def fit(self, D: mi.Float) -> None:
+        """Put the fit of cut cells where their moments are, as such moments as a whole cell of this fit has.
+
+        Those of whole cells stay: `UnscatteredLight` takes the mean from D_0 and slopes from 12 / (1 + RIDGE) D_j.
+
+        Args:
+            D: (slots, channels, 4) in a row, ∫ f x_j dx of each cell, shared by those of one fit; changed in place.
+        """
+        n = len(mi.Spectrum(0))
+        A = [dr.gather(mi.Vector4f, self.solve, 4 * dr.arange(mi.UInt32, dr.width(self.cut)) + i) for i in range(4)]
+        found = []
+        for c in range(n):
+            b = dr.gather(mi.Vector4f, D, self.cut * n + c)
+            value, *slopes = (dr.dot(row, b) for row in A)
+            found.append(mi.Vector4f(value, *(v * ((1 + RIDGE) / 12) for v in slopes)))
+        dr.eval(found)
+        del b, value, slopes  # which read D: it would be copied
+        for c, row in enumerate(found):
+            dr.scatter(D, row, self.cut * n + c)
+        dr.eval(D)
+
+
+def brick_counts(box: tuple[np.ndarray, np.ndarray], h: float) -> np.ndarray:
+    """Bricks of a grid along its axes, with a rim of more than a cell around the box."""
+    return np.ceil(((box[1] - box[0]) / h + 2 * MARGIN + 2) / BRICK).astype(int)
+
+
+def cell_edge(
+    box: tuple[np.ndarray, np.ndarray], extent: Callable[[], tuple[float, float]], h: float, depths: tuple[float, float]
+) -> float:
+    """h, or the least edge by which an object has no more than MOST_BRICKS and MOST_SLOTS.
+
+    Args:
+        box: its least and largest coordinates.
+        extent: its area and volume, asked only where the box could hold more cells.
+        h: edge that is wanted.
+        depths: as in `InsideCells.of`.
+    """
+    # cells of the box, else fine and coarse ones below the surface: half of the bricks that it cuts, and those near
+    known = None
+    while True:
+        if np.prod(brick_counts(box, h)) <= MOST_BRICKS:
+            if np.prod((box[1] - box[0]) / h) <= MOST_SLOTS:
+                return h
+            area, volume = known = known or extent()
+            near, far = (np.ceil(min(depth / (BRICK * h), 1e6)) for depth in depths)
+            layers = 1 + BRICK * (0.5 + near) + BRICK * (far - near) / 8
+            if min(area / h**2 * layers, volume / h**3) <= MOST_SLOTS:
+                return h
+        h *= 1.05
+
+
+def _inside(
+    media: WalkMedia, k: int, crossed: tuple[np.ndarray, np.ndarray, np.ndarray], low: np.ndarray, h: float,
+    counts: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Which cells are inside as a whole, (bricks that the surface cuts, 64), and which of all bricks.
+
+    Args:
+        crossed: which bricks the surface may cut, their numbers, and which of their cells, (bricks, 64).
+    """
+    # ---- cells and bricks between the crossed ones are inside or outside all together: a ray from one of them tells
+    surface, bricks, cut = crossed
+    rows, parts = _connected(~cut)
+    beyond, n = label(~surface.reshape(counts[::-1]))
+    beyond, one = beyond.ravel(), np.zeros(n + 1, dtype=int)
+    one[beyond] = np.arange(len(beyond))
+    lowest = np.log2((parts & (~parts + np.uint64(1))).astype(float)).astype(int)
+    middles = [_cells_of(bricks[rows], lowest, counts) + 0.5, _cells_of(one[1:], 0 * one[1:], counts) + 0.5 * BRICK]
+    starts = _starts_inside(media, k, _points(np.concatenate(middles), low, h))
+
+    # ---- those, and all with them
+    cells = np.zeros(len(bricks), dtype=np.uint64)
+    found = starts[: len(rows)]
+    np.bitwise_or.at(cells, rows[found], parts[found])
+    return _flags(cells), np.concatenate([[False], starts[len(rows) :]])[beyond]
+
+
+def _bits(flags: np.ndarray) -> np.ndarray:
+    """The bits of n numbers from (n, 64) flags."""
+    return np.packbits(flags, axis=1, bitorder="little").view("<u8").ravel().astype(np.uint64)
+
+
+def _flags(bits: np.ndarray) -> np.ndarray:
+    """(n, 64) flags from the bits of n numbers."""
+    return np.unpackbits(bits.astype("<u8").view(np.uint8).reshape(-1, 8), axis=1, bitorder="little").astype(bool)
+
+
+def _connected(free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The parts of bricks whose free cells touch by their faces: the place of the brick of each, and its cells as bits.
+
+    Args:
+        free: (bricks, 64) which cells are free.
+    """
+    left, rows, parts = _bits(free), np.arange(len(free)), []
+    edges = [(np.uint64(4**a), _bits((P < 3)[None])[0], _bits((P > 0)[None])[0]) for a, P in enumerate(PLACES)]
+    places = []
+    while len(rows := rows[left[rows] != 0]):
+        # ---- fill from the lowest free cell, as long as any brick has more to fill
+        room = left[rows]
+        part = room & (~room + np.uint64(1))
+        while True:
+            grown = part.copy()
+            for step, up, down in edges:
+                grown |= ((part & up) << step) | ((part & down) >> step)
+            grown &= room
+            if (grown == part).all():
+                break
+            part = grown
+        left[rows] &= ~part
+        places.append(rows)
+        parts.append(part)
+    return np.concatenate([*places, np.empty(0, int)]), np.concatenate([*parts, np.empty(0, np.uint64)])
+
+
+def _numbered(held: np.ndarray, fine: np.ndarray, coarse: np.ndarray, bricks: int) -> tuple[CellIndex, np.ndarray, int]:
+    """Cells by number, their slots in fine bricks, and how many slots there are.
+
+    Args:
+        held: (fine, 64) which cells of these bricks hold a part of the inside.
+        fine, coarse: numbers of these bricks.
+        bricks: number of all.
+    """
+    slot = np.where(held, np.cumsum(held, dtype=np.int32).reshape(held.shape) - 1, -1)
+    n, last = int(np.count_nonzero(held)), (BRICK // 2) ** 3
+    brick = np.full(bricks, -1, dtype=np.int32)
+    brick[fine] = 2 * BRICK**3 * np.arange(len(fine))
+    brick[coarse] = 2 * (slot.size + last * np.arange(len(coarse))) + 1
+    slots = n + last * len(coarse)
+    cells = np.concatenate([slot.ravel(), np.arange(n, slots, dtype=np.int32)])
+    return CellIndex(mi.Int32(brick), mi.Int32(cells)), slot, slots
+
+
+def _solutions(moments: np.ndarray, place: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """Matrices of least squares over the inside, (cut, 4, 4): from moments of f its value at the centre and slopes by h.
+
+    Args:
+        moments: (cut, 4, 4) m_jk of the inside of cells.
+        place, offset: of the cell whose fit each shares, and the way from its centre.
+    """
+    # ---- moments of all that share a fit, about the centre of that cell
+    shares = np.flatnonzero(place != np.arange(len(place)))
+    shift = np.tile(np.eye(4, dtype=np.float32), (len(shares), 1, 1))
+    shift[:, 1:, 0] = offset[shares]
+    moved = shift @ moments[shares] @ shift.transpose(0, 2, 1)
+    np.add.at(moments, place[shares], moved)
+
+    # ---- slopes about the centroid, C^-1 (b / V - x b_0 / V), and the value at the centre; by parts, to save memory
+    result, ridge = np.empty_like(moments), np.float32(RIDGE / 12) * np.eye(3, dtype=np.float32)
+    for start in range(0, len(moments), AT_ONCE):
+        M, A = (values[start : start + AT_ONCE] for values in (moments, result))
         V, x = M[:, :1, 0], M[:, 1:, 0] / M[:, :1, 0]
-        C = M[:, 1:, 1:] / V[:, :, None] - x[:, :, None] * x[:, None, :] + RIDGE / 12 * np.eye(3)
-        mean = b[:, :, 0] / V
-        slopes = (b[:, :, 1:] / V[:, :, None] - mean[:, :, None] * x[:, None]) @ _inverse(C)
-        value = mean - np.einsum("scj,sj->sc", slopes, x)
+        C = M[:, 1:, 1:] / V[:, :, None] - x[:, :, None] * x[:, None, :] + ridge
+        A[:, 1:, 1:] = _inverse(C) / V[:, :, None]
+        A[:, 1:, 0] = -np.einsum("sij,sj->si", A[:, 1:, 1:], x)
+        A[:, 0] = -np.einsum("sj,sjk->sk", x, A[:, 1:])
+        A[:, 0, 0] += 1 / V[:, 0]
 
-        # ---- of each cell that of its parent, about its own centre
-        value, slopes = value[parent], slopes[parent]
-        value = value + np.einsum("scj,sj->sc", slopes, offset)
-        result[rows] = np.concatenate([value[:, :, None], slopes], axis=2)
-        return result
-
-    def shared(self, values: np.ndarray) -> np.ndarray:
-        """(slots, ...) values, of each cell the sum over all that share its fit."""
-        result = values.copy()
-        result[self.cut] = _added(values[self.cut], self.place)[self.place]
-        return result
+    # ---- of each cell that of the one whose fit it shares, about its own centre
+    result[shares] = result[place[shares]]
+    result[shares, 0] += np.einsum("sj,sjk->sk", offset[shares], result[shares, 1:])
+    return result
 
 
 def _inverse(C: np.ndarray) -> np.ndarray:
@@ -153,45 +347,61 @@ def _inverse(C: np.ndarray) -> np.ndarray:
     return rows / (C[:, 0] * rows[:, 0]).sum(axis=1)[:, None, None]
 
 
-def _added(values: np.ndarray, parent: np.ndarray) -> np.ndarray:
-    """With the values of cells that share the fit of another added to its own."""
-    total, shares = values.copy(), parent != np.arange(len(parent))
-    np.add.at(total, parent[shares], values[shares])
-    return total
+def _crossed_bricks(points: SurfaceParts, low: np.ndarray, h: float, counts: np.ndarray) -> np.ndarray:
+    """Which bricks the surface may cut: points reach them."""
+    crossed = dr.zeros(mi.Bool, int(counts.prod()))
+    for part in points(POINTS[0] / h**2):
+        for _, brick, ok in _reached(part, low, h, counts):
+            dr.scatter(crossed, True, brick, ok)
+        dr.eval(crossed)
+    return np.array(crossed)
 
 
-def grid_edge(box: tuple[np.ndarray, np.ndarray], h: float) -> float:
-    """h, or the least edge of cells whose grid has at most MOST_CELLS."""
-    size = box[1] - box[0]
-    while np.prod(np.ceil(size / h + 2 * MARGIN) + 2) > MOST_CELLS:
-        h *= 1.05
-    return h
+def _crossed_cells(
+    points: SurfaceParts, low: np.ndarray, h: float, counts: np.ndarray, bricks: np.ndarray
+) -> np.ndarray:
+    """The axis nearest to a normal in each cell of bricks, (bricks, 64); -1 where no point reaches.
+
+    It is that of the point whose normal is nearest to an axis.
+    """
+    place = np.full(int(counts.prod()), -1, dtype=np.int32)
+    place[bricks] = np.arange(len(bricks))
+    place, best = mi.Int32(place), dr.zeros(mi.UInt32, BRICK**3 * len(bricks))
+    for part in points(POINTS[1] / h**2):
+        n = dr.abs(part.n)
+        axis = dr.select(n.x >= dr.maximum(n.y, n.z), mi.UInt32(0), dr.select(n.y >= n.z, mi.UInt32(1), 2))
+        rank = 4 * mi.UInt32(2**20 * dr.max(n)) + axis + 1
+        for cell, brick, ok in _reached(part, low, h, counts):
+            within = ((cell.z % BRICK) * BRICK + cell.y % BRICK) * BRICK + cell.x % BRICK
+            row = dr.gather(mi.Int32, place, brick, ok)
+            ok &= row >= 0
+            dr.scatter_reduce(dr.ReduceOp.Max, best, rank, mi.UInt32(row * BRICK**3 + within), ok)
+        dr.eval(best)
+    return (np.array(best) % 4).astype(np.int8).reshape(-1, BRICK**3) - 1
 
 
-def _crossed(points: EntrySample, low: np.ndarray, h: float, counts: np.ndarray) -> np.ndarray:
-    """The axis nearest to the normal of the surface in each cell that it may cut, -1 of others: points reach it."""
-    n_cells = int(counts.prod())
-    squares = [dr.zeros(mi.Float, n_cells) for _ in range(3)]
-    x = [(points.p[a] - opaque(low[a])) * opaque(1 / h) for a in range(3)]
-    n = [dr.opaque(mi.Int32, int(c)) for c in counts]
+def _reached(
+    points: EntrySample, low: np.ndarray, h: float, counts: np.ndarray
+) -> Iterator[tuple[mi.Vector3i, mi.UInt32, mi.Bool]]:
+    """Cells within MARGIN of points, from the corner of the grid, their bricks, and whether the grid has them."""
+    x = (points.p - mi.Point3f(*(opaque(v) for v in low))) * opaque(1 / h)
+    n = mi.Vector3i(*(dr.opaque(mi.Int32, int(c)) for c in counts))
     for corner in range(8):
-        cell = [mi.Int32(dr.floor(v + (MARGIN if corner >> a & 1 else -MARGIN))) for a, v in enumerate(x)]
-        ok = mi.Bool(True)
-        for c, most in zip(cell, n):
-            ok &= (c >= 0) & (c < most)
-        for a in range(3):
-            dr.scatter_add(squares[a], dr.square(points.n[a]), (cell[2] * n[1] + cell[1]) * n[0] + cell[0], ok)
-    dr.eval(squares)
-    x, y, z = (np.array(v) for v in squares)
-    axis = np.where(x >= np.maximum(y, z), 0, np.where(y >= z, 1, 2)).astype(np.int8)
-    axis[x + y + z == 0] = -1
-    return axis
+        cell = mi.Vector3i(dr.floor(x + mi.Vector3f(*(MARGIN if corner >> a & 1 else -MARGIN for a in range(3)))))
+        brick = cell // BRICK
+        yield cell, mi.UInt32((brick.z * n.y + brick.y) * n.x + brick.x), dr.all((cell >= 0) & (brick < n))
 
 
-def _centres(cells: np.ndarray, low: np.ndarray, h: float, counts: np.ndarray) -> mi.Point3f:
-    z, rest = np.divmod(cells, counts[1] * counts[0])
+def _cells_of(bricks: np.ndarray, cell: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Places of cells (n, 3), by the number of their brick and of the cell in it."""
+    z, rest = np.divmod(bricks, counts[1] * counts[0])
     y, x = np.divmod(rest, counts[0])
-    return mi.Point3f(*(low[a] + (v + 0.5) * h for a, v in enumerate((x, y, z))))
+    return np.stack([BRICK * v + P[cell] for v, P in zip((x, y, z), PLACES)], axis=1)
+
+
+def _points(x: np.ndarray, low: np.ndarray, h: float) -> mi.Point3f:
+    """Points at places of the grid, (n, 3) in units of h."""
+    return mi.Point3f((low + h * x).T.astype(np.float32))
 
 
 def _own_hit(media: WalkMedia, k: mi.Int32, ray: mi.Ray3f) -> tuple[mi.Float, mi.Bool, mi.Bool]:
@@ -231,25 +441,23 @@ def _starts_inside(media: WalkMedia, k: int, p: mi.Point3f) -> np.ndarray:
     return votes >= 2
 
 
-def _measure(
-    media: WalkMedia, k: int, cells: np.ndarray, axes: np.ndarray, low: np.ndarray, h: float, counts: np.ndarray
-) -> np.ndarray:
+def _measure(media: WalkMedia, k: int, centre: mi.Point3f, axes: np.ndarray, h: float) -> np.ndarray:
     """Moments (cells, 4, 4) of the inside of cells, from columns at jittered places.
 
     They run along the axis nearest to the normal of the surface, in which they are exact: what is left of their noise
     would make light, divided by the volume of a small part, too bright in the mean.
     """
-    n = len(cells)
-    centre = _centres(cells, low, h, counts)
+    n = len(axes)
+    across_cell = COLUMNS[n >= FINE]
     number, edge, axis = dr.full(mi.Int32, k, n), opaque(h), mi.UInt32(axes.astype(np.uint32))
     d = mi.Vector3f(*(dr.select(axis == a, mi.Float(1), 0) for a in range(3)))
     rng = generator(mi, n, pass_seed(k))
-    total = dr.opaque(mi.UInt32, COLUMNS**2)
+    total, side = (dr.opaque(mi.UInt32, v) for v in (across_cell**2, across_cell))
 
     def column(i: mi.UInt32, rng: mi.PCG32, sums: list[mi.Float]) -> tuple:
         # ---- a column through the cell
-        u = (mi.Float(i % COLUMNS) + rng.next_float32()) / COLUMNS - 0.5
-        v = (mi.Float(i // COLUMNS) + rng.next_float32()) / COLUMNS - 0.5
+        u = (mi.Float(i % side) + rng.next_float32()) / mi.Float(side) - 0.5
+        v = (mi.Float(i // side) + rng.next_float32()) / mi.Float(side) - 0.5
         across = dr.select(
             axis == 0, mi.Vector3f(0, u, v), dr.select(axis == 1, mi.Vector3f(v, 0, u), mi.Vector3f(u, v, 0))
         )
@@ -277,23 +485,30 @@ def _measure(
     state = (dr.zeros(mi.UInt32, n), rng, [dr.zeros(mi.Float, n) for _ in PAIRS])
     _, _, sums = dr.while_loop(state, lambda i, rng, sums: i < total, column, label="columns")
     dr.eval(sums)
-    square = np.empty((n, 4, 4))
+    square = np.empty((n, 4, 4), dtype=np.float32)
     for (i, j), values in zip(PAIRS, sums):
-        square[:, i, j] = square[:, j, i] = np.array(values, dtype=float) / COLUMNS**2
+        square[:, i, j] = square[:, j, i] = np.array(values) / across_cell**2
     return square
 
 
 def _parents(cells: np.ndarray, volume: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Of each cut cell the one whose fit it shares, for a small one its largest neighbour, and the way from there."""
-    parent, offset = np.arange(len(cells)), np.zeros((len(cells), 3))
+    # ---- cells by their number in the grid, which has an empty rim: no neighbour of one lies across its end
+    strides = np.array([1, counts[0], counts[0] * counts[1]])
+    number = cells @ strides
+    order = np.argsort(number)
+    ordered = number[order]
+    parent, offset = np.arange(len(cells)), np.zeros((len(cells), 3), dtype=np.float32)
     small = np.flatnonzero(volume < SMALLEST)
-    strides, best = np.array([1, counts[0], counts[0] * counts[1]]), np.full(len(small), SMALLEST)
+    best = np.full(len(small), SMALLEST)
+
+    # ---- the largest of six
     for axis in range(3):
         for step in (-1, 1):
-            # the grid has an empty rim, so that no neighbour of an inner cell lies across its end
-            other = np.searchsorted(cells, cells[small] + step * strides[axis]).clip(max=len(cells) - 1)
-            size = np.where(cells[other] == cells[small] + step * strides[axis], volume[other], 0)
+            wanted = number[small] + step * strides[axis]
+            at = np.searchsorted(ordered, wanted).clip(max=len(cells) - 1)
+            size = np.where(ordered[at] == wanted, volume[order[at]], 0)
             better = size > best
-            best[better], parent[small[better]] = size[better], other[better]
+            best[better], parent[small[better]] = size[better], order[at[better]]
             offset[small[better]] = -step * (np.arange(3) == axis)
     return parent, offset

@@ -27,7 +27,10 @@ that: phase functions are cut after q_2 = g² instead, and MOST_TRUNCATED bounds
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import zip_longest
 from typing import Any
 
@@ -36,20 +39,22 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.geometry.instances import InstanceTransform, corners, ends_of
-from full_geometry.geometry.light_points import lattice, uniform_entries
+from full_geometry.geometry.light_points import uniform_entries
 from full_geometry.geometry.points import EntrySample, cosine_above, cosine_density, lift, opaque, sided
 from full_geometry.geometry.rounding import blocked, ray_from
 from full_geometry.precomputed.forward_scattering import kept_forward, quadratic_part, split_extinction, truncated
-from full_geometry.precomputed.inside_cells import POINTS, InsideCells, grid_edge
+from full_geometry.precomputed.inside_cells import RIDGE, CellIndex, InsideCells, cell_edge
+from full_geometry.precomputed.transport_matrix import R_2
 from full_geometry.walk.media import WalkMedia
 from full_geometry.walk.random_walk import Event, fly, free_path, pick, sample_bsdf, turn
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 EDGE, FORWARD_EDGE = 0.9, 0.6  # of cells, mean free paths of the light in them
 MOST_EDGE = 1.5  # beyond, the mean of an image is more than .5 % off
-DEPTH = 12.0  # mean free paths below the surface: e^-12 is left of light there
+DEPTHS = 3.6, 9.0  # mean free paths below the surface, at which cells are coarse and end: e^-9 is left of light there
 ALONG = 6  # points on a segment of a ray
-FEWEST_POINTS, MOST_POINTS = 2**14, 2**22  # of the surface, that find the cells it cuts
+FEWEST_POINTS, MOST_POINTS = 2**14, 2**18  # of the surface that find its cells, of all and at once
+MOST_INTEGER = 2**15 - 1  # of 16 bits, for a direction of 1
 BY_COSINE = 0.25  # of the directions to emitters
 MOST_TRUNCATED = 0.5  # abs(g) of media that vary or have textures, above which three coefficients are too few
 ROULETTE = 0.1  # part of its light below which a reflected ray may end
@@ -61,49 +66,46 @@ class UnscatteredLight:
     """Unscattered light inside the objects of a scene.
 
     Args:
-        slot: of the cells of all objects, one after the other.
-        fluence: of each slot and channel the value at the centre and the slopes by units of h.
-        directions: of each slot and channel f_x, f_y, f_z, M_xx, M_yy, M_xy, M_xz, M_yz; None where all media scatter
-            evenly.
-        tables: by the number of an object, where its cells begin, their corner, 1/h and counts.
+        index: of the cells of all objects, one after the other.
+        fluence: of each slot and channel ∫ phi (1, x, y, z) dx, x from the centre of the cell by its edge.
+        directions: of each slot and channel f_x, f_y, f_z, M_xx, M_yy, M_xy, M_xz, M_yz in 16 bits each; None where all
+            media scatter evenly.
+        tables: by the number of an object, where its bricks begin, their corner, 1/h and counts.
         forward: whether it has met forward events, see `forward_scattering`.
     """
 
-    slot: mi.Int32
+    index: CellIndex
     fluence: mi.Float
-    directions: mi.Float | None
+    directions: mi.UInt32 | None
     tables: dict[str, Any]
     forward: bool
 
     def light(self, media: WalkMedia, event: Event) -> mi.Spectrum:
         """Unscattered light that an event of a walk scatters on along it, per weight of the walk."""
-        # ---- find the cell of the event, and its slot
+        # ---- find the cell of the event
         at = {key: dr.gather(type(t), t, media.place_of(event.object)) for key, t in self.tables.items()}
-        x = (event.p - at["low"]) * at["scale"]
-        cell = mi.Vector3i(dr.floor(x))
-        inside = dr.all((cell >= 0) & (cell < at["counts"]))
-        index = at["first"] + (cell.z * at["counts"].y + cell.y) * at["counts"].x + cell.x
-        slot = dr.gather(mi.Int32, self.slot, index, inside)
-        held, y = inside & (slot >= 0), x - (mi.Vector3f(cell) + 0.5)
+        x = mi.Point3f((event.p - at["low"]) * at["scale"])
+        slot, y, inverse, held = self.index.find(x, at["first"], at["counts"])
 
-        # ---- evaluate the fluence there, phi(y) = phi_0 + s.y, y from the centre in units of h
-        n = len(mi.Spectrum(0))
+        # ---- evaluate the fluence there, phi(y) = (D_0 + 12 / (1 + RIDGE) D.y) / edge³
+        n, y, inverse = len(mi.Spectrum(0)), y * (12 / (1 + RIDGE)), inverse * at["scale"]
         rows = [dr.gather(mi.Vector4f, self.fluence, mi.UInt32(slot * n + c), held) for c in range(n)]
         phi = mi.Spectrum([v.x + v.y * y.x + v.z * y.y + v.w * y.z for v in rows])
+        phi *= inverse * dr.square(inverse) / (4 * dr.pi)
         if self.directions is None:
-            return phi / (4 * dr.pi)
+            return phi
 
         # ---- q_0 + 3 q_1 w.f + 5/2 q_2 (3 w^T M w - 1), w^T M w by the trace of 1
         x, y, z = event.along.x, event.along.y, event.along.z
         result = []
         for c, g in enumerate(event.m.g):
-            index = mi.UInt32(slot * n + c) * 2
-            a, b = (dr.gather(mi.Vector4f, self.directions, index + i, held) for i in range(2))
+            packed = dr.gather(mi.Vector4u, self.directions, mi.UInt32(slot * n + c), held)
+            a, b = (mi.Vector4f(mi.Vector4i(v) >> 16) / MOST_INTEGER for v in (packed << 16, packed))
             squares = a.w * (x * x - z * z) + b.x * (y * y - z * z) + z * z
             squares += 2 * (b.y * x * y + b.z * x * z + b.w * y * z)
             q_0, q_1, q_2 = quadratic_part(g) if self.forward else truncated(g)
             J = q_0 + 3 * q_1 * (a.x * x + a.y * y + a.z * z) + 2.5 * q_2 * (3 * squares - 1)
-            result.append(phi[c] * J / (4 * dr.pi))
+            result.append(phi[c] * J)
         return mi.Spectrum(result)
 
 
@@ -119,46 +121,55 @@ def unscattered_light(
         cells: of the objects, from `inside_cells_of`.
         rays: of light, for each object.
     """
-    # ---- trace light into the cells of each object, and fit its fluence and directions in each cell
+    # ---- trace light into the cells of each object, fit its fluence and directions, and put all into one table
+    n = len(mi.Spectrum(0))
     directional = any(np.any(inside.medium.g) for inside in media.specs)
-    slots, values, angles, first = [], [], [], 0
-    rows = {"first": [], "low": [], "scale": [], "counts": []}
-    start = 0
+    bricks, slots, fluence, directions = [], [], [], []
+    rows: dict[str, list] = {"first": [], "low": [], "scale": [], "counts": []}
+    bricks_before, cells_before, slots_before = 0, 0, 0
     for k, grid in enumerate(cells):
         D, w = _moments(scene, media, k, grid, seed, rays, directional)
-        slot = np.array(grid.slot)
-        slots.append(np.where(slot >= 0, slot + start, -1))
-        values.append(grid.fit(D / grid.h**3))
-        angles.append(_directions(w, D[:, :, :1], grid) if directional else [])
-        for key, value in (("first", first), ("low", grid.low), ("scale", 1 / grid.h), ("counts", grid.counts)):
+        grid.share(D, 4 * n, moments=True)
+        if directional:
+            grid.share(w, 8 * n)
+            directions.append(_directions(w, D))
+        grid.fit(D)
+        fluence.append(D)
+        brick, slot = grid.index.brick, grid.index.slot
+        bricks.append(dr.select(brick >= 0, brick + dr.opaque(mi.Int32, 2 * cells_before), -1))
+        slots.append(dr.select(slot >= 0, slot + dr.opaque(mi.Int32, slots_before), -1))
+        for key, value in (("first", bricks_before), ("low", grid.low), ("scale", 1 / grid.h), ("counts", grid.counts)):
             rows[key].append(value)
-        first, start = first + slot.size, start + grid.slots
-
-    # ---- put the cells of all objects into one table
+        bricks_before, cells_before = bricks_before + dr.width(brick), cells_before + dr.width(slot)
+        slots_before += grid.slots
     kinds = {"first": mi.Int32, "low": mi.Point3f, "scale": mi.Float, "counts": mi.Vector3i}
     tables = {key: kind(np.array(rows[key]).T) for key, kind in kinds.items()}
-    slot, *arrays = (
-        mi.Int32(np.concatenate(slots)),
-        *(mi.Float(np.concatenate(v).astype(np.float32).ravel()) for v in (values, angles)),
-    )
-    dr.make_opaque(tables, slot, arrays)
-    return UnscatteredLight(slot, arrays[0], arrays[1] if directional else None, tables, forward(media))
+    index = CellIndex(_joined(bricks), _joined(slots))
+    light = _joined(fluence), _joined(directions) if directional else None
+    dr.make_opaque(tables, index, light)
+    return UnscatteredLight(index, *light, tables, forward(media))
 
 
-def _directions(w: np.ndarray, light: np.ndarray, grid: InsideCells) -> np.ndarray:
-    """f and M of the light of cells, (slots, channels, 8), over that of the cells that share a fit.
+def _joined(parts: list) -> Any:
+    return parts[0] if len(parts) == 1 else dr.concat(parts)
+
+
+def _directions(w: mi.Float, D: mi.Float) -> mi.UInt32:
+    """f and M of the light of cells, over that of all cells that share a fit, in 16 bits each.
 
     Args:
         w: (slots, channels, 8) ∫ L_0 w dw dx, and likewise w_x², w_y², w_x w_y, w_x w_z, w_y w_z.
-        light: (slots, channels, 1) ∫ L_0 dw dx.
-        grid: tells the cells that share the fit of another.
+        D: (slots, channels, 4) of which the first is ∫ L_0 dw dx.
     """
-    # cells that share a fit have one distribution of directions: that of all their light
-    w, light = (grid.shared(values) for values in (w, light))
-    result = w / np.maximum(light, 1e-30)
+    lanes = dr.arange(mi.UInt32, dr.width(D) // 4)
+    light = dr.gather(mi.Float, D, 4 * lanes)
     # where emitters have negative texels, moments are no longer those of a distribution
-    result[light[..., 0] <= 1e-30] = 0
-    return np.clip(result, -1, 1)
+    scale = dr.select(light > 1e-30, MOST_INTEGER / light, 0)
+    rows = [dr.gather(mi.Vector4f, w, 2 * lanes + i) * scale for i in range(2)]
+    a, b = (mi.Vector4i(dr.round(dr.clip(row, -MOST_INTEGER, MOST_INTEGER))) for row in rows)
+    result = dr.ravel(mi.Vector4u((a & 0xFFFF) | (b << 16)))
+    dr.eval(result)
+    return result
 
 
 def obstacle(media: WalkMedia) -> str:
@@ -168,7 +179,7 @@ def obstacle(media: WalkMedia) -> str:
     if media.inner is not None:
         return "something lies inside an object"
     for k, kind in enumerate(media.instance_table.kind):
-        h = _edges(media, k)[1] * float(np.mean(_extinction(media, kind)))
+        h = _grid(media, k)[1] * float(np.mean(_extinction(media, kind)))
         if h > MOST_EDGE:
             return f"object {media.objects[kind].name} is so many mean free paths wide that cells have {h:.2g}"
     for obj, inside, around in zip_longest(media.objects, media.specs, media.wrappings):
@@ -188,25 +199,50 @@ def obstacle(media: WalkMedia) -> str:
 def inside_cells_of(media: WalkMedia) -> list[InsideCells]:
     """The cells of all objects."""
     results = []
-    for k, kind in enumerate(media.instance_table.kind):
-        # scale the number of points by the surface in units of h², with its area from a few of them
-        box, h = _edges(media, k)
-        depth = np.inf if media.varies else DEPTH / float(np.min(_extinction(media, kind)))
-        area = float(
-            np.mean(np.array(_entries(media, k, [mi.Float(v.astype(np.float32)) for v in lattice(2**10)]).weight))
-        )
-        n = int(np.clip(POINTS * area / h**2, FEWEST_POINTS, MOST_POINTS))
-        points = _entries(media, k, [mi.Float(v.astype(np.float32)) for v in lattice(n)])
-        results.append(InsideCells.of(media, k, points, box, h, depth))
+    for k in range(len(media.instance_table.kind)):
+        box, h, depths = _grid(media, k)
+        points = partial(_surface_points, media, k, _extent(media, k)[0])
+        results.append(InsideCells.of(media, k, points, box, h, depths))
     return results
 
 
-def _edges(media: WalkMedia, k: int) -> tuple[tuple[np.ndarray, np.ndarray], float]:
-    """The box of object k, and the edge of its cells, scene units."""
+def _grid(media: WalkMedia, k: int) -> tuple[tuple[np.ndarray, np.ndarray], float, tuple[float, float]]:
+    """Of object k its box, the edge of its cells, and the depths beyond which they are coarse and end, scene units."""
     kind = media.instance_table.kind[k]
     low, high = ends_of(corners(media.objects[kind].scene.bbox(), _to_world(media, k)[None]))
-    edge = FORWARD_EDGE if forward(media) else EDGE
-    return (low[0], high[0]), grid_edge((low[0], high[0]), edge / float(np.mean(_extinction(media, kind))))
+    edge, extinction = FORWARD_EDGE if forward(media) else EDGE, _extinction(media, kind)
+    depths = (np.inf, np.inf) if media.varies else tuple(depth / float(np.min(extinction)) for depth in DEPTHS)
+    box = low[0], high[0]
+    return box, cell_edge(box, lambda: _extent(media, k), edge / float(np.mean(extinction)), depths), depths
+
+
+def _extent(media: WalkMedia, k: int) -> tuple[float, float]:
+    """Area and volume of object k, from points of its surface."""
+    at = next(_surface_points(media, k, 1, 2**12))
+    height = dr.sum((at.p - mi.Point3f(at.p.x[0], at.p.y[0], at.p.z[0])) * at.n)
+    area, sums = (float(np.mean(np.array(at.weight * v))) for v in (mi.Float(1) + 0 * height, height))
+    return area, abs(sums) / 3
+
+
+def _surface_points(media: WalkMedia, k: int, area: float, density: float) -> Iterator[EntrySample]:
+    """Points over the surface of object k in order along its faces, of this density, by parts of MOST_POINTS."""
+    n = max(density * area, FEWEST_POINTS)
+    parts = math.ceil(n / MOST_POINTS)
+    width = math.ceil(n / parts)
+    for part in range(parts):
+        u = (dr.arange(mi.Float, width) + 0.5) * opaque(1 / (width * parts)) + opaque(part / parts)
+        yield _entries(media, k, [dr.minimum(u, 1 - 2**-24), *_multiples(R_2, (0.5, 0.5), width, part * width)])
+
+
+def _multiples(roots: tuple[float, ...], shift: Iterable[float], width: int, first: int = 0) -> list[mi.Float]:
+    """Multiples of roots from `first` on, shifted, in [0, 1): in whole numbers, which float32 would round."""
+    result = []
+    for root, s in zip(roots, shift):
+        step = int(root * 2**32)
+        start = (int(s * 2**32) + first * step) % 2**32
+        step, start = (dr.opaque(mi.UInt32, v) for v in (step, start))
+        result.append(mi.Float((dr.arange(mi.UInt32, width) * step + start) >> 8) * 2**-24)
+    return result
 
 
 def _extinction(media: WalkMedia, kind: int) -> np.ndarray:
@@ -288,11 +324,7 @@ class _Rays:
 
         # ---- points in order along the faces, with a sample of the emitters each
         shift = np.random.default_rng([seed, number]).random(5)
-        u = [(dr.arange(mi.Float, rays) + opaque(shift[4])) / opaque(rays)]
-        for root, s in zip(R_4, shift):
-            # multiples of a root in whole numbers, which float32 would round
-            step, first = (dr.opaque(mi.UInt32, int(v * 2**32) % 2**32) for v in (root, s))
-            u.append(mi.Float((dr.arange(mi.UInt32, rays) * step + first) >> 8) * 2**-24)
+        u = [(dr.arange(mi.Float, rays) + opaque(shift[4])) / opaque(rays), *_multiples(R_4, shift, rays)]
         at = _entries(media, number, [dr.minimum(u[0], 1 - 2**-24), u[1], u[2]])
         si = dr.zeros(mi.SurfaceInteraction3f, rays)
         si.p, si.n, si.sh_frame = mi.Point3f(at.p), mi.Normal3f(at.n), mi.Frame3f(at.n_out)
@@ -431,12 +463,8 @@ class _Rays:
             light = ray.flux * ray.T * self._transmittance(ray, s, rng) / dr.maximum(pdf * ALONG, 1e-20)
 
             # ---- its cell, and its place there
-            x = (ray.o + ray.d * s - low) * scale
-            cell = mi.Vector3i(dr.floor(x))
-            y = x - (mi.Vector3f(cell) + 0.5)
-            held = active & (far > 0) & dr.all((cell >= 0) & (cell < counts))
-            slot = dr.gather(mi.Int32, grid.slot, (cell.z * counts.y + cell.y) * counts.x + cell.x, held)
-            held &= slot >= 0
+            x = mi.Point3f((ray.o + ray.d * s - low) * scale)
+            slot, y, _, held = grid.index.find(x, mi.Int32(0), counts, active & (far > 0))
 
             # ---- light x_j by channel, and light by directions
             for c in range(n):
@@ -462,8 +490,8 @@ def _only(flags: int) -> mi.BSDFContext:
 
 def _moments(
     scene: mi.Scene, media: WalkMedia, k: int, grid: InsideCells, seed: int, rays: int, directional: bool
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """D of the cells of object k, shape (slots, channels, 4), and their `w`, (slots, channels, 8) if `directional`."""
+) -> tuple[mi.Float, mi.Float | None]:
+    """D of the cells of object k, (slots, channels, 4) in a row, and their w, (slots, channels, 8) if `directional`."""
     n = len(mi.Spectrum(0))
     D = dr.zeros(mi.Float, grid.slots * n * 4)
     w = dr.zeros(mi.Float, grid.slots * n * 8) if directional else None
@@ -471,5 +499,4 @@ def _moments(
     start = traced.enter(k, rays, seed)
     dr.while_loop((start,), lambda ray: ray.alive, lambda ray: (traced.segment(ray),), label="rays of light")
     dr.eval(D, w)
-    D = np.array(D).reshape(grid.slots, n, 4)
-    return D, np.array(w).reshape(grid.slots, n, 8) if directional else None
+    return D, w

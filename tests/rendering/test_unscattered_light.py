@@ -67,48 +67,79 @@ def _compare(surface: dict, known_to: float, shape: dict | None = None, spp: int
 # ---- cells
 
 
-def _cells(shape: dict) -> Any:
+def _cells(shape: dict, surface: dict = MEDIUM) -> Any:
     from full_geometry.precomputed.unscattered_light import inside_cells_of
     from full_geometry.walk.media import WalkMedia
 
-    scene = _scene("precomputed", MEDIUM, shape, light={"type": "constant"})
+    scene = _scene("precomputed", surface, shape, light={"type": "constant"})
     return inside_cells_of(WalkMedia.of(scene, 1.0))[0]
 
 
-def _volume(cells: Any) -> float:
-    return (cells.slots - len(cells.cut) + cells.moments[:, 0, 0].sum()) * cells.h**3
+def _moments(cells: Any) -> tuple[np.ndarray, ...]:
+    """Slots of cells that do not share the fit of another, their centres, edges and moments, with those that do."""
+    # ---- places of slots in fine and in coarse bricks
+    brick, slot = (np.array(v) for v in (cells.index.brick, cells.index.slot))
+    centre, edge = np.full((cells.slots, 3), np.nan), np.full(cells.slots, cells.h)
+    for n in (4, 2):
+        number = np.flatnonzero((brick >= 0) & (brick % 2 == (n == 2)))
+        at = slot[brick[number, None] // 2 + np.arange(n**3)]
+        corner = np.stack(np.unravel_index(number, cells.counts[::-1])[::-1], axis=1)
+        place = np.stack(np.unravel_index(np.arange(n**3), (n, n, n))[::-1], axis=1)
+        middle = cells.low + 4 * cells.h * (corner[:, None] + (place + 0.5) / n)
+        centre[at[at >= 0]], edge[at[at >= 0]] = middle[at >= 0], 4 / n * cells.h
+    assert np.isfinite(centre).all()
+
+    # ---- moments, of cut cells the inverse of their solution without its ridge
+    M = np.zeros((cells.slots, 4, 4)) + np.diag([1, 1 / 12, 1 / 12, 1 / 12])
+    cut, place = np.array(cells.cut), np.array(cells.place)
+    M[cut] = np.linalg.inv(np.array(cells.solve, dtype=float).reshape(-1, 4, 4))
+    M[cut] -= 0.02 / 12 * M[cut, :1, :1] * np.diag([0, 1, 1, 1])
+    own = np.setdiff1d(np.arange(cells.slots), cut[place != np.arange(len(place))])
+    return own, centre[own], edge[own], M[own]
 
 
 @pytest.mark.parametrize(("shape", "volume"), [(_ball, 4 / 3 * np.pi * 125), (_cube, 512.0)])
 def test_cells_have_the_volume_of_an_object(shape: Any, volume: float) -> None:
-    assert _volume(_cells(shape())) == pytest.approx(volume, rel=2e-3)
+    _, _, edge, M = _moments(_cells(shape()))
+    assert (M[:, 0, 0] * edge**3).sum() == pytest.approx(volume, rel=2e-3)
 
 
 def test_cells_know_the_second_moments_of_a_ball() -> None:
     """∫ x² of a ball is 4/15 pi R^5."""
-    cells = _cells(_ball())
-    slot = np.array(cells.slot)
-    place = np.stack(np.unravel_index(np.flatnonzero(slot >= 0), cells.counts[::-1])[::-1], axis=1)
-    centre = cells.low + (place + 0.5) * cells.h
-    whole = np.zeros((cells.slots, 4, 4)) + np.diag([1, 1 / 12, 1 / 12, 1 / 12])
-    whole[cells.cut] = cells.moments
-    V, x, xx = whole[:, 0, 0], whole[:, 0, 1:], np.einsum("sjj->sj", whole[:, 1:, 1:])
-    total = (V[:, None] * centre**2 + 2 * cells.h * x * centre + cells.h**2 * xx).sum(axis=0) * cells.h**3
+    _, centre, edge, M = _moments(_cells(_ball()))
+    V, x, xx = M[:, :1, 0], M[:, 1:, 0], np.einsum("sjj->sj", M[:, 1:, 1:])
+    edge = edge[:, None]
+    total = ((V * centre**2 + 2 * edge * x * centre + edge**2 * xx) * edge**3).sum(axis=0)
     assert total == pytest.approx(4 / 15 * np.pi * 5**5, rel=5e-3)
+
+
+def test_cells_of_an_object_of_hundreds_of_mean_free_paths_are_those_near_its_surface() -> None:
+    cells = _cells(_ball(), {"sigma_s": 8.0, "sigma_a": 0.0, "eta": 1.4})
+    _, centre, edge, M = _moments(cells)
+    depth, free_path = 5 - np.linalg.norm(centre, axis=1), 1 / 8
+    whole = M[:, 0, 0] == 1
+    assert depth.max() < 25 * free_path
+    # none is left out where light is
+    shells = np.arange(2.5, 9) * free_path
+    found = np.histogram(depth[whole], shells, weights=edge[whole] ** 3)[0]
+    assert found == pytest.approx(4 / 3 * np.pi * -np.diff((5 - shells) ** 3), rel=0.1)
 
 
 def test_the_fit_keeps_the_integral_over_cells_that_share_it() -> None:
     cells = _cells(_cube())
-    D = np.random.default_rng(1).random((cells.slots, 3, 4))
-    fit = cells.fit(D)
-    whole = np.zeros((cells.slots, 4)) + [1, 0, 0, 0]
-    whole[cells.cut] = cells.moments[:, 0]
-    kept = np.einsum("scj,sj->sc", fit, whole)
-    groups, inner = cells.cut[cells.place], np.setdiff1d(np.arange(cells.slots), cells.cut)
-    assert kept[inner] == pytest.approx(D[inner, :, 0])
-    for group in np.unique(groups):
-        members = cells.cut[groups == group]
-        assert kept[members].sum(axis=0) == pytest.approx(D[members, :, 0].sum(axis=0))
+    start = np.random.default_rng(1).random((cells.slots, 3, 4), dtype=np.float32)
+    D = mi.Float(start.ravel().copy())  # with whose memory it begins
+    cells.share(D, 12, moments=True)
+    shared = np.array(D).reshape(start.shape)
+    cells.fit(D)
+    fit = np.array(D).reshape(start.shape)
+    cut, place = np.array(cells.cut), np.array(cells.place)
+    own, _, _, M = _moments(cells)
+    kept = fit[own, :, 0] * M[:, :1, 0] + np.einsum("scj,sj->sc", fit[own, :, 1:], M[:, 1:, 0]) * 12 / 1.02
+    assert kept[np.isin(own, cut)] == pytest.approx(shared[own[np.isin(own, cut)], :, 0], abs=1e-4)
+    inner = np.setdiff1d(np.arange(cells.slots), cut)
+    assert (fit[inner] == start[inner]).all()
+    assert shared[cut[np.unique(place)], :, 0].sum() == pytest.approx(start[cut, :, 0].sum(), rel=1e-5)
 
 
 # ---- images
