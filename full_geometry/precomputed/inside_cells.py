@@ -89,7 +89,7 @@ class InsideCells:
         slots: number of the cells that hold a part of the inside.
         cut: (cut,) slots of the cells that the surface cuts; all others are whole.
         place: (cut,) of each of them the place in `cut` of the cell whose fit it shares, its own for most.
-        offset: of each its centre from that of this cell, in units of h.
+        offset: of each the way from the centre of that one, in units of h.
         solve: (cut, 4, 4) in a row, coefficients of its fit from the moments ∫ f x_j dx / h³ of all that share it.
     """
 
@@ -311,7 +311,7 @@ def _numbered(held: np.ndarray, fine: np.ndarray, coarse: np.ndarray, bricks: in
 
 
 def _solutions(moments: np.ndarray, place: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """Matrices of least squares over the inside, (cut, 4, 4): from moments of f its value at the centre and slopes by h.
+    """Least squares over the inside, (cut, 4, 4): from moments of f its value at the centre and its slopes by h.
 
     Args:
         moments: (cut, 4, 4) m_jk of the inside of cells.

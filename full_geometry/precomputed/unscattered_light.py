@@ -52,7 +52,7 @@ from halfspace_sss.tracing.walk import generator, pass_seed
 EDGE, FORWARD_EDGE = 0.9, 0.6  # of cells, mean free paths of the light in them
 MOST_EDGE = 1.5  # beyond, the mean of an image is more than .5 % off
 DEPTHS = 3.6, 9.0  # mean free paths below the surface, at which cells are coarse and end: e^-9 is left of light there
-ALONG = 6  # points on a segment of a ray
+ALONG, FORWARD_ALONG = 6, 1  # points on a segment of a ray; forward events part it into many
 FEWEST_POINTS, MOST_POINTS = 2**14, 2**18  # of the surface that find its cells, of all and at once
 MOST_INTEGER = 2**15 - 1  # of 16 bits, for a direction of 1
 BY_COSINE = 0.25  # of the directions to emitters
@@ -207,7 +207,7 @@ def inside_cells_of(media: WalkMedia) -> list[InsideCells]:
 
 
 def _grid(media: WalkMedia, k: int) -> tuple[tuple[np.ndarray, np.ndarray], float, tuple[float, float]]:
-    """Of object k its box, the edge of its cells, and the depths beyond which they are coarse and end, scene units."""
+    """The box of object k, the edge of its cells, and the depths beyond which they are coarse and end, scene units."""
     kind = media.instance_table.kind[k]
     low, high = ends_of(corners(media.objects[kind].scene.bbox(), _to_world(media, k)[None]))
     edge, extinction = FORWARD_EDGE if forward(media) else EDGE, _extinction(media, kind)
@@ -444,8 +444,8 @@ class _Rays:
         return _Ray(**state, rng=rng)
 
     def _add(self, ray: _Ray, far: mi.Float, active: mi.Bool) -> None:
-        """Add light to the cells at ALONG points of a segment, drawn by mean_c sigma_c T_c / (1 - T_c(far))."""
-        grid, n = self.grid, len(mi.Spectrum(0))
+        """Add light to the cells at points of a segment, drawn by mean_c sigma_c T_c / (1 - T_c(far))."""
+        grid, n, points = self.grid, len(mi.Spectrum(0)), FORWARD_ALONG if self.forward else ALONG
         sigma_t = self.media.spectrum("sigma_t", self.k)
         low, scale = mi.Point3f(*(opaque(v) for v in grid.low)), opaque(1 / grid.h)
         counts = mi.Vector3i(*(dr.opaque(mi.Int32, int(v)) for v in grid.counts))
@@ -457,10 +457,10 @@ class _Rays:
         def add(j: mi.UInt32, rng: mi.PCG32) -> tuple[mi.UInt32, mi.PCG32]:
             # ---- a point at the distance s
             rate, end = (pick(v, (first + j) % n) for v in (sigma_t, ends))
-            u = u_0 + mi.Float(j) / ALONG
+            u = u_0 + mi.Float(j) / points
             s = dr.minimum(-dr.log(1 - dr.minimum((u - dr.floor(u)) * end, 1 - 2**-24)) / rate, far)
             pdf = dr.sum(sigma_t * dr.exp(-sigma_t * s) / dr.maximum(ends, 1e-20)) / n
-            light = ray.flux * ray.T * self._transmittance(ray, s, rng) / dr.maximum(pdf * ALONG, 1e-20)
+            light = ray.flux * ray.T * self._transmittance(ray, s, rng) / dr.maximum(pdf * points, 1e-20)
 
             # ---- its cell, and its place there
             x = mi.Point3f((ray.o + ray.d * s - low) * scale)
@@ -474,7 +474,7 @@ class _Rays:
                     dr.scatter_add(self.w, part * light[c], index * 2 + i, held)
             return j + 1, rng
 
-        dr.while_loop((mi.UInt32(0), mi.PCG32(ray.rng)), lambda j, rng: j < ALONG, add, label="points of a ray")
+        dr.while_loop((mi.UInt32(0), mi.PCG32(ray.rng)), lambda j, rng: j < points, add, label="points of a ray")
 
     def _transmittance(self, ray: _Ray, s: mi.Float, rng: mi.PCG32 | None = None) -> mi.Spectrum:
         """exp(-∫ sigma_t) over a distance along a ray."""
