@@ -110,10 +110,14 @@ def coefficients_of_frequencies(
         raise ValueError(f"reflectance must be in (0, 1) for each frequency, got {R.tolist()}")
     if not np.all(error > 0):
         raise ValueError(f"error must be > 0, got {error.tolist()}")
-    forward = _by_white_trace(by) if isinstance(by, Readings) else _by_model(by, g, eta)
+    white = _by_white_trace(by) if isinstance(by, Readings) else None
 
     def residual(x: np.ndarray) -> np.ndarray:
-        return (forward(f, *np.exp(x)) - R) / error
+        sigma_a, sigma_s_prime = np.exp(x).tolist()
+        if white:
+            return (white(f, sigma_a, sigma_s_prime) - R) / error
+        model = bssrdf(by, Medium(sigma_s_prime / (1 - g), sigma_a, g, eta))
+        return (frequency_reflectance(model, f, "total") - R) / error
 
     s = START[1] * max(np.median(f), 1e-3)
     fit = least_squares(residual, np.log([START[0] * s, s]), bounds=(np.log(1e-8), np.log(1e6)), x_scale=1.0)
@@ -121,14 +125,6 @@ def coefficients_of_frequencies(
         raise ValueError(f"reflectance must be that of a medium, got {R.tolist()}, off by {fit.fun.tolist()} errors")
     value, spread = np.exp(fit.x), np.sqrt(np.diag(np.linalg.pinv(fit.jac.T @ fit.jac)))
     return ReducedCoefficients(*(Integral(float(v), float(v * e)) for v, e in zip(value, spread)))
-
-
-def _by_model(name: str, g: float, eta: float) -> Callable[..., np.ndarray]:
-    def forward(f: np.ndarray, sigma_a: float, sigma_s_prime: float) -> np.ndarray:
-        model = bssrdf(name, Medium(sigma_s_prime / (1 - g), sigma_a, g, eta))
-        return frequency_reflectance(model, f, "total")
-
-    return forward
 
 
 def _by_white_trace(readings: Readings) -> Callable[..., np.ndarray]:

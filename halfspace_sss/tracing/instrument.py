@@ -166,10 +166,15 @@ class PathTally(Tally):
 
 
 class DepthTally(Tally):
-    """Flux times the largest depth of its path, flux, and the depth so far of each lane's walk."""
+    """Weight after each scattering event; cells (ring or elsewhere, depth).
 
-    def __init__(self, types: ModuleType) -> None:
+    Sums are flux times the largest depth of its path, flux, and the depth so far of each lane's walk.
+    """
+
+    def __init__(self, types: ModuleType, edges2: Lanes | None, depths: np.ndarray) -> None:
         self.Float = types.Float
+        self.edges2, self.depths, self.n = edges2, types.Float(depths), len(depths) - 1
+        self.cells = CellSums(types, _places(edges2) * self.n)
 
     def start(self, lanes: int) -> tuple:
         import drjit as dr
@@ -182,20 +187,9 @@ class DepthTally(Tally):
     def scatter(self, sums: tuple, event: Scatter) -> tuple:
         import drjit as dr
 
-        return sums[0], sums[1], dr.select(event.order == 1, event.z, dr.maximum(sums[2], event.z))
-
-
-class FluenceTally(Tally):
-    """Weight after each scattering event; cells (ring or elsewhere, depth)."""
-
-    def __init__(self, types: ModuleType, edges2: Lanes | None, depths: np.ndarray) -> None:
-        self.edges2, self.depths, self.n = edges2, types.Float(depths), len(depths) - 1
-        self.cells = CellSums(types, _places(edges2) * self.n)
-
-    def scatter(self, sums: tuple, event: Scatter) -> tuple:
         depth, inside = find_cell(self.depths, event.z)
         self.cells.add(event.weight, _place(self.edges2, event) * self.n + depth, event.lane, inside)
-        return sums
+        return sums[0], sums[1], dr.select(event.order == 1, event.z, dr.maximum(sums[2], event.z))
 
 
 class DetectorTally(Tally):
@@ -270,8 +264,7 @@ class Recorder:
         if asked.white:
             self.named["white"] = PathTally(types, edges2, None)
         if asked.depths is not None:
-            self.named["fluence"] = FluenceTally(types, edges2, asked.depths * self.sigma_t)
-            self.named["depth"] = DepthTally(types)
+            self.named["depths"] = DepthTally(types, edges2, asked.depths * self.sigma_t)
         if asked.detectors:
             self.named["detectors"] = DetectorTally(types, asked.detectors, self.medium, self.symmetric)
         return list(self.named.values())
@@ -280,10 +273,11 @@ class Recorder:
         """Keep what a pass has found; its tallies end with those of the instrument."""
         for (name, tally), sums in zip(self.named.items(), done.sums[len(done.sums) - len(self.named) :]):
             if hasattr(tally, "cells"):
-                found = done.cells(tally.cells).reshape(tally.cells.batches, -1, tally.n)
-            else:
-                found = np.stack([s.numpy() for s in sums], axis=1) * (done.T_i / done.per_lane)[:, None]
-            self.parts.setdefault(name, []).append(found)
+                cells = done.cells(tally.cells).reshape(tally.cells.batches, -1, tally.n)
+                self.parts.setdefault(name, []).append(cells)
+            if sums:
+                lanes = np.stack([s.numpy() for s in sums], axis=1) * (done.T_i / done.per_lane)[:, None]
+                self.parts.setdefault(f"{name} by lane", []).append(lanes)
 
     def readings(self) -> Readings:
         """What all passes found together."""
@@ -338,12 +332,12 @@ class Readings:
 
         Without radii the integral over the plane, that is under uniform irradiance 1; shape (depths,).
         """
-        samples = self._asked("fluence") / (float(self.medium.sigma_s) * np.diff(self.instrument.depths))
+        samples = self._asked("depths") / (float(self.medium.sigma_s) * np.diff(self.instrument.depths))
         return estimate(samples[:, 0] if self.radii is None else samples[:, :-1] / self._areas()[:, None])
 
     def mean_depth(self) -> Estimate:
         """Mean of the largest depth that the light that leaves has reached, mm."""
-        depth, flux = self._asked("depth")[:, :2].T
+        depth, flux = self._asked("depths by lane")[:, :2].T
         if not flux.mean() > 0:
             return Estimate(math.nan, math.nan)
         mean = depth.mean() / flux.mean()
@@ -352,12 +346,11 @@ class Readings:
 
     def collected(self) -> Estimate:
         """Fraction of incident flux on each of `detectors` within its aperture."""
-        return estimate(self._asked("detectors"))
+        return estimate(self._asked("detectors by lane"))
 
     def _asked(self, name: str) -> np.ndarray:
         if name not in self._samples:
-            option = {"fluence": "depths", "depth": "depths"}.get(name, name)
-            raise ValueError(f"{option} must be given in the instrument for this reading, got none")
+            raise ValueError(f"{name.split()[0]} must be given in the instrument for this reading, got none")
         return self._samples[name]
 
     def _rings(self, name: str) -> np.ndarray:
