@@ -8,7 +8,7 @@ Jensen and Buhler (2002) take two passes so with a dipole; here the second is a 
 
 What is not known: a dependence of the model on the azimuth between light and view; how light varies over directions,
 apart from its a(mu)-weighted mean, first moment, and what S along a few directions of it brings in the neighbourhood;
-detail of light below the distance of the points. Its noise is that of the gathering.
+detail of light below the distance of the points (`fine_light` keeps its flux). Its noise is that of the gathering.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from full_geometry.geometry.light_points import GOLDEN, SurfacePoints
 from full_geometry.geometry.points import cosine_above, of_rows, opaque, place
 from full_geometry.geometry.rounding import blocked, ray_from
 from full_geometry.geometry.snapshot import Snapshot, same_objects
+from full_geometry.integrators.fine_light import fine_light
 from full_geometry.integrators.inner_light import COUNT, inner_light
 from full_geometry.integrators.lighting import EnvironmentMean, Lights
 from full_geometry.integrators.surface_paths import trace_paths
@@ -46,6 +47,8 @@ from halfspace_sss.backend import clock
 from halfspace_sss.interrupts import checkpoint
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from full_geometry.geometry.instances import InstanceScene
     from full_geometry.geometry.points import SurfacePoint
     from full_geometry.objects.objects import TranslucentObject
@@ -251,7 +254,9 @@ def _leaving(
     """B of object k, by light in parts whose differences tell the noise, and light inside."""
     # ---- L at the points, in parts, and the light of emitters by ray
     obj, (T, events) = objects[k], of
-    found, rays = _incident(scene, objects, T, obj.geometry.clearance, settings, 2 * k + seed, parts)
+    fine = fine_light(scene, objects[0].instance_scene, obj, T)
+    left_out = () if fine is None else fine.emitters
+    found, rays = _incident(scene, objects, (T, obj.geometry.clearance, left_out), settings, 2 * k + seed, parts)
     lights, others = zip(*found)
     if not all(np.isfinite(light.mean).all() for light in lights):
         raise ValueError(f"light at object {obj.geometry.name} must be finite, got NaN or infinity")
@@ -269,6 +274,8 @@ def _leaving(
     light = Incident.mean_of(lights)
     B = T @ light
     B[:, :, 0] += c
+    if fine is not None:
+        B += fine.leaving(T, scaled=obj.textured is None)
 
     # ---- what S along directions of light has beyond T; averages over the neighbourhood would cross edges of textures
     if obj.textured is None:
@@ -293,8 +300,7 @@ def _leaving(
 def _incident(
     scene: mi.Scene,
     objects: list[TranslucentObject],
-    T: TransportMatrix,
-    e: mi.Float,
+    of: tuple[TransportMatrix, mi.Float, Sequence[mi.Emitter]],
     settings: Settings,
     seed: int,
     parts: int,
@@ -302,7 +308,9 @@ def _incident(
     """Incident radiance at all points, and the mean of other surfaces that each sees, in parts; light by ray.
 
     Parts are independent estimates by as many directions each, of one launch. Rays have the light of emitters alone.
+    `of` are the matrix, how far rounding puts points off the surface, and emitters that are left out.
     """
+    T, e, left_out = of
     # ---- n directions for each point and part; lanes of kernels that serve other numbers of points too
     count, rows = len(T.points), len(T.points) * parts
     n = int(np.clip(DIRECTIONS // (2 * count), FEWEST, MOST)) // TRACED * TRACED
@@ -320,7 +328,7 @@ def _incident(
     point = j % _numbers(count)[0]
     at = GatheringPoint(*(dr.gather(type(v), v, point) for v in (T.points.p, T.points.n, T.points.n_out)), e)
     u, v = (_stratified(sampler, j, s, each) for _ in range(2))
-    aimed, w_e = by_emitters(scene, objects[0].instance_scene, T.albedo, at, u)
+    aimed, w_e = by_emitters(scene, objects[0].instance_scene, T.albedo, at, u, left_out=left_out)
     met, more, a, w_c, on = by_cosine((scene, objects, settings), T.albedo, at, v, traced, sampler)
 
     # ---- Σ L and Σ L (bent w - middle) over the directions of each row
@@ -425,6 +433,7 @@ def by_emitters(
     at: GatheringPoint,
     u: mi.Point2f,
     c: mi.Spectrum | float = 0.0,
+    left_out: Sequence[mi.Emitter] = (),
 ) -> tuple[mi.Spectrum, mi.Vector3f]:
     """Light of sampled emitters less c, and its direction: a mu (L - c) V / p_e with its MIS weight."""
     # w by emitters, and what is between
@@ -432,6 +441,8 @@ def by_emitters(
     ds, light = sample_emitter(scene, here, u, mi.Bool(True))
     a, pdf = _weight(albedo, at, ds.d)
     above = (ds.pdf > 0) & (pdf > 0)
+    for emitter in left_out:
+        above &= ds.emitter != mi.EmitterPtr(emitter)
     light = dr.select(blocked(scene, instance_scene.ray_to_emitter(here, ds, at.e), above), 0, light)
 
     # a mu / p_e times L V - c, times p_e / (p_e + p_mu)
