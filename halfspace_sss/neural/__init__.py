@@ -1,6 +1,6 @@
 """Learnt BSSRDFs of a half-space, order >= 2, and their training.
 
-- `neural`: one network for every medium with albedo in [0, 1], g in [-0.5, 0.98], eta in [1, 2]; needs no training.
+- `neural`: one network for media of albedo in [0, 1], g in [-0.5, 0.98], eta in [1, 2]; needs no training.
 - `neural_material`: a small network of one medium, trained in seconds by `train`.
 - `neural_paper`: the architecture and loss of the paper, to compare with.
 

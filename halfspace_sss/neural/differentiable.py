@@ -13,8 +13,9 @@ import numpy as np
 from halfspace_sss.arrays import Lanes, Real, broadcast_query, is_torch, library
 from halfspace_sss.interface.query import Query
 from halfspace_sss.neural.features import medium_features, symmetric_features, travel
-from halfspace_sss.neural.hypernetwork import N_TERMS, Hypernetwork, Layers, log_calibration
+from halfspace_sss.neural.hypernetwork import N_TERMS, Hypernetwork, Layers
 from halfspace_sss.neural.perceptron import Perceptron, cooperative, silu
+from halfspace_sss.neural.symmetric import log_calibrations
 from halfspace_sss.neural.universal import load_hypernetwork, shipped_weights
 from halfspace_sss.physics.backbone import backbone_shape, length_scale
 from halfspace_sss.physics.fresnel import F_t
@@ -48,8 +49,7 @@ def neural_S(
     q = Query(lib, sigma_t * r, mu_i, phi_i, mu_o, phi_o, eta)
     features = symmetric_features(lib, q.r, *travel(q), L)
     evaluate, layered = (_torch_network, _torch_terms) if is_torch(lib) else (_drjit_network, _drjit_terms)
-    terms = layered(hyper, c, q.r)
-    factor = lib.exp(evaluate(hyper, c, features) + log_calibration(terms, q.mu_i) + log_calibration(terms, q.mu_o))
+    factor = lib.exp(evaluate(hyper, c, features) + log_calibrations(layered(hyper, c, q.r), q))
     G = albedo * albedo * (backbone_shape(q.r, albedo, g, eta) * factor)
     return sigma_t * sigma_t * F_t(mu_i, eta) * F_t(mu_o, eta) * G
 

@@ -30,10 +30,9 @@ import numpy as np
 from halfspace_sss.arrays import Lanes, Real, library
 from halfspace_sss.interface.query import Query
 from halfspace_sss.neural.features import symmetric_features, travel
-from halfspace_sss.neural.hypernetwork import log_calibration
 from halfspace_sss.neural.network import Network
 from halfspace_sss.neural.perceptron import Perceptron
-from halfspace_sss.neural.symmetric import LOG_RANGE, SymmetricModel
+from halfspace_sss.neural.symmetric import LOG_RANGE, SymmetricModel, log_calibrations
 from halfspace_sss.physics.backbone import backbone_shape, length_scale
 
 PLACES = 0.1, 0.9  # of the two networks among the models
@@ -112,8 +111,7 @@ def _queries(longest: float, eta: float) -> Query:
 
 
 def _log_factor(model: SymmetricModel, q: Query) -> np.ndarray:
-    c = model.calibrations[0]
-    return model.networks[0](_features(q, _length(model))) + log_calibration(c, q.mu_i) + log_calibration(c, q.mu_o)
+    return model.networks[0](_features(q, _length(model))) + log_calibrations(model.calibrations[0], q)
 
 
 def _weights(models: Sequence[SymmetricModel], q: Query, log_factors: np.ndarray) -> np.ndarray:

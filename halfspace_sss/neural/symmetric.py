@@ -18,16 +18,21 @@ from halfspace_sss.physics.medium import Medium
 LOG_RANGE = 30.0  # bound of the logarithm of the learnt factor
 
 
+def log_calibrations(c: Sequence[Real], q: Query) -> Real:
+    """log a(mu_i) a(mu_o) of a query, see `log_calibration`."""
+    return log_calibration(c, q.mu_i, q.mu_i_in) + log_calibration(c, q.mu_o, q.mu_o_in)
+
+
 def factored_G(network: Network, q: Query, albedo: Real, g: Real, eta: Real, calibration: Sequence[float] = ()) -> Real:
     """G = B(r) exp(network(features)) a(mu_i) a(mu_o) of one channel: positive, reciprocal and mirror-invariant.
 
-    `calibration` are the coefficients of log a, see `calibration`; without them a is 1.
+    `calibration` are the coefficients of log a, see `log_calibration`; without them a is 1.
     """
     lib, L = q.lib, q.constant(length_scale(albedo, g))
     log_factor = network(symmetric_features(lib, q.r, *travel(q), L))
     if len(calibration):
         c = [q.constant(v) for v in calibration]
-        log_factor = log_factor + (log_calibration(c, q.mu_i) + log_calibration(c, q.mu_o))
+        log_factor = log_factor + log_calibrations(c, q)
     factor = lib.exp(lib.minimum(lib.maximum(log_factor, -LOG_RANGE), LOG_RANGE))
     return q.constant(albedo * albedo) * (backbone_shape(q.r, albedo, g, eta) * factor)
 

@@ -71,7 +71,7 @@ class Neural(SymmetricModel):
     A second network maps albedo, g and eta to the numbers theta of the small one, a third to those of a, which holds S
     to the exact reflectance (`calibration`): both once, so that evaluation costs that of the small one. Positive,
     reciprocal and mirror-invariant by construction. Trained on path tracing over albedo [0, 1], g [-0.5, 0.98],
-    eta [1, 2]; other media are refused. Single scattering is left out.
+    eta [1, 2]; other media are refused, and g above 0.8 for eta below 1.1. Single scattering is left out.
     """
 
     name = "neural"

@@ -23,6 +23,10 @@ QUERY = (np.array([0.3, 1.0, 2.0]), 0.7, 0.4, 0.9, 0.2)
     [
         (Medium.from_albedo(0.5, 1.0, 0.985, 1.3), "g must be in [-0.5, 0.98]"),
         (Medium.from_albedo(0.5, 1.0, -0.6, 1.3), "g must be in [-0.5, 0.98]"),
+        (
+            Medium.from_albedo(0.5, 1.0, 0.81, 1.09),
+            "g must be in [-0.5, 0.8] for the neural",
+        ),
         (Medium.from_albedo(0.5, 1.0, 0.0, 0.9), "eta must be in [1, 2]"),
         (Medium.from_albedo(0.5, 1.0, 0.0, 2.1), "eta must be in [1, 2]"),
     ],

@@ -11,10 +11,10 @@ import pytest
 from halfspace_sss import Medium, bssrdf, trace
 from halfspace_sss.comparison.model_truths import exits, sampled_reflectance
 from halfspace_sss.comparison.truths import Truth, read_truths
-from halfspace_sss.neural.hypernetwork import N_TERMS, log_calibration
+from halfspace_sss.neural.hypernetwork import N_TERMS, calibration_terms, in_range, log_calibration
 from halfspace_sss.neural.universal import load_hypernetwork, shipped_weights
 from halfspace_sss.physics import single_scattering
-from halfspace_sss.physics.fresnel import F_r
+from halfspace_sss.physics.fresnel import F_r, mu_internal
 
 POINTS, RING_POINTS = 2**13, 2**16
 WITHIN = 0.015  # of every reflectance
@@ -29,7 +29,7 @@ def _bright(measures: tuple[str, ...]) -> list[Truth]:
     return [
         t
         for t in read_truths()[0]
-        if t.measure in measures and 0.5 <= t.medium.albedo and t.medium.g <= 0.95 and 1 <= t.medium.eta <= 2
+        if t.measure in measures and 0.5 <= t.medium.albedo and t.medium.g <= 0.95 and in_range(t.medium)
     ]
 
 
@@ -83,7 +83,7 @@ def test_radial_profiles_of_the_table_are_met() -> None:
 @pytest.mark.slow
 def test_radial_profiles_of_walks_are_met_also_where_the_boundary_is_matched() -> None:
     off = []
-    for albedo, g, mu_i, eta in [(*ratios, eta) for ratios in TRACED for eta in (1.0, 1.4)]:
+    for albedo, g, mu_i, eta in [(*ratios, eta) for ratios in TRACED for eta in (1.0 if ratios[1] < 0.9 else 1.1, 1.4)]:
         medium = Medium.from_albedo(albedo, 1.0, g, eta)
         L = 1 / math.sqrt(3 * (1 - albedo) * (1 - albedo * g))
         edges = np.concatenate([[0.0], np.geomspace(0.02, 20, 13)]) * max(L, 0.3)
@@ -95,27 +95,54 @@ def test_radial_profiles_of_walks_are_met_also_where_the_boundary_is_matched() -
     assert len(off) > 100 and np.median(off) < 0.01 and np.quantile(off, 0.9) < 0.03
 
 
-@pytest.mark.parametrize("ratios", [(1.0, -0.5, 2.0), (1.0, 0.0, 1.0), (1.0, -0.5, 1.0), (0.05, 0.0, 1.3)])
-def test_reflectances_at_the_ends_of_the_range_are_met_from_0_3_to_normal_incidence(ratios: tuple) -> None:
-    medium = Medium.from_albedo(ratios[0], 1.0, *ratios[1:])
-    model = bssrdf("neural", medium)
-    for mu_i in (0.3, 1.0):
-        R = medium.reflectance(mu_i) - single_scattering.reflectance(medium, mu_i)
-        assert sampled_reflectance(model, mu_i)[0] == pytest.approx(R, rel=2 * WITHIN)
+STEEP, MATCHED = [(g, eta) for g in (0.9, 0.98) for eta in (1.1, 1.5, 2.0)], [1.0, 1.02, 1.1, 1.5, 2.0]
+CORNERS = [(a, *rest) for a in (0.05, 0.5, 0.9, 0.97, 0.999, 1.0)
+           for rest in [*STEEP, *((g, eta) for g in (-0.5, 0.0, 0.8) for eta in MATCHED)]]  # fmt: skip
+DARK = 2e-4  # R that is off by less is of hardly any light
+DAILY_CORNERS = [
+    (1.0, -0.5, 1.0),
+    (1.0, 0.8, 1.0),
+    (1.0, 0.98, 1.1),
+    (1.0, 0.98, 2.0),
+    (0.97, 0.98, 1.1),
+    (0.999, 0.8, 1.02),
+]
+
+
+@pytest.mark.parametrize(
+    "corners", [pytest.param(DAILY_CORNERS, id="some"), pytest.param(CORNERS, id="all", marks=pytest.mark.slow)]
+)
+def test_reflectances_of_the_corners_of_the_range_are_met_within_1_5_percent_and_none_is_above_1(corners) -> None:
+    """At albedo 1, g 0.98 it was 0.76 to 2.3 times the exact one for eta 1 to 1.05, 3 to 6 % off for larger ones."""
+    off, mu_i = {}, [0.05, 0.1, 0.3, 1.0]
+    for ratios in corners:
+        medium = Medium.from_albedo(ratios[0], 1.0, *ratios[1:])
+        flux = exits(bssrdf("neural", medium), np.repeat(mu_i, 3).tolist(), POINTS // 2, (0,)).flux.sum(axis=1)
+        R, error = flux.reshape(-1, 3).mean(axis=1), flux.reshape(-1, 3).std(axis=1, ddof=1) / math.sqrt(3)
+        R += single_scattering.reflectance(medium, np.array(mu_i))
+        exact = np.array([medium.reflectance(mu) for mu in mu_i])
+        assert np.all(R < 1 + 3 * error)
+        wrong = np.abs(R - exact) - 3 * error > np.maximum(WITHIN * exact, DARK)
+        if wrong.any():
+            off[ratios] = (np.round(R / exact - 1, 4), np.round(error / exact, 4))
+    assert off == {}
 
 
 @pytest.mark.parametrize("albedo", [0.0, 0.5, 1.0])
-@pytest.mark.parametrize("g", [-0.5, 0.98])
-@pytest.mark.parametrize("eta", [1.0, 2.0])
-def test_the_factor_of_every_medium_is_between_a_half_and_two(albedo: float, g: float, eta: float) -> None:
-    c = load_hypernetwork(shipped_weights()).calibration(albedo, g, eta)
-    assert len(c) == N_TERMS and np.abs(log_calibration(c, np.linspace(0, 1, 11))).max() < math.log(2)
+@pytest.mark.parametrize(("g", "eta"), [(-0.5, 1.0), (0.8, 1.0), (-0.5, 2.0), (0.98, 2.0), (0.98, 1.1)])
+def test_the_factor_of_every_medium_is_between_a_half_and_two_but_for_grazing_light(
+    albedo: float, g: float, eta: float
+) -> None:
+    c, mu = load_hypernetwork(shipped_weights()).calibration(albedo, g, eta), np.linspace(0, 1, 11)
+    factor = np.abs(log_calibration(c, mu, mu_internal(mu, eta)))
+    assert len(c) == N_TERMS and factor[0] < math.log(4) and factor[1:].max() < math.log(2)
 
 
-def test_the_logarithm_of_the_factor_is_a_sum_of_chebyshev_polynomials() -> None:
-    c, mu = np.array([0.3, -0.2, 0.1, 0.05]), np.linspace(0, 1, 7)
-    np.testing.assert_allclose(log_calibration(c, mu), np.polynomial.chebyshev.chebval(2 * mu - 1, c), atol=1e-15)
-    assert np.all(log_calibration((), mu) == 0)
+def test_the_logarithm_of_the_factor_is_a_sum_of_its_terms() -> None:
+    c, mu = np.array([0.3, -0.2, 0.1, 0.05, 0.2, -0.4]), np.linspace(0, 1, 7)
+    inside = mu_internal(mu, 1.3)
+    np.testing.assert_allclose(log_calibration(c, mu, inside), calibration_terms(mu, inside) @ c, atol=1e-15)
+    assert np.all(log_calibration((), mu, inside) == 0)
 
 
 def test_a_model_is_made_in_20_ms_and_names_its_factor() -> None:

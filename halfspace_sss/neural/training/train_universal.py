@@ -1,8 +1,9 @@
 """Training of the network for all media: maps of many media, a fit, and a fit of `calibration` to exact reflectances.
 
-For each medium, at some cosines of incidence, are known the exact R of order >= 2 (discrete ordinates less the exact
-single order) and the flux of the network towards 16 intervals of cosines of exit. The coefficients of a follow from the
-medium by a network whose loss is the squared logarithm of a(mu_i) sum_b flux_b a(mu_b) over R.
+For each medium, at some cosines of incidence, are known the exact R of all orders (discrete ordinates), that of the
+single order, and the flux of the network towards 40 intervals of cosines of exit. The coefficients of a follow from the
+medium by a network whose loss is the squared logarithm of a(mu_i) sum_b flux_b a(mu_b) and the single order over R. It
+aims below R where that is close to 1, by about its error, so that no light is made.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from halfspace_sss.neural.hypernetwork import (
     RANGES,
     Hypernetwork,
     Layers,
-    chebyshev,
+    calibration_terms,
     named_layers,
 )
 from halfspace_sss.neural.store import save_weights
@@ -43,29 +44,32 @@ from halfspace_sss.neural.training.unfinished import CHECKPOINT, claim
 from halfspace_sss.neural.universal import hypernetwork_of
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.backbone import length_scale
+from halfspace_sss.physics.fresnel import mu_internal
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import JsonDict, check_folder, provenance, write_atomically
 
-INTERVALS = 16  # of the cosine of exit
-COSINES = 2  # of incidence, of each medium
-MATCHED = 0.25  # of the media at least have eta = 1, where the network is weakest
+INTERVALS, STEEPNESS = 40, 1.7  # of the cosine of exit, and the power by which they are narrow near the horizon
+COSINES = 6  # of incidence, of each medium, as close there
+STEEP = 0.6  # of the media have g as in (0.86, 0.98) and, nearly half of them, eta = 1: there the network is weakest
 LEAST_ALBEDO = 0.05  # below it R of order >= 2 drowns in the rounding of both orders; a goes on as it is there
 POINTS, REPEATS = 2048, 4  # of a proposal; scrambles
 NOISY, MORE = 3e-3, 8  # relative error above which a medium gets more points, and how many times as many
-TRUSTED, EXACT = 2e-3, 2e-5  # relative errors: that counts in full, of the exact reflectance of all orders
+TRUSTED = 3e-3  # relative error that counts in full
+BELOW, BRIGHT = 5e-3, 0.03  # part of R by which it is undercut where it is 1; from 1 - BRIGHT on
 OUTLIER = 0.03  # of a logarithm, from which on it counts linearly
 WIDTH, HIDDEN = 64, 3
 CHUNK = 64  # media of a file
 
 
 class Fluxes(NamedTuple):
-    """For n media: albedo, g, eta (n, 3); cosines of incidence (n, COSINES); of each the exact R of order >= 2, that of
-    the network towards each interval (n, COSINES, INTERVALS), and the relative error of both together."""
+    """For n media: albedo, g, eta (n, 3); cosines of incidence (n, COSINES); of each the exact R of all orders and of
+    the single one, and the flux of the network towards each interval (n, COSINES, INTERVALS) with its error over R."""
 
     ratios: np.ndarray
     mu_i: np.ndarray
     exact: np.ndarray
+    single: np.ndarray
     flux: np.ndarray
     error: np.ndarray
 
@@ -75,17 +79,15 @@ def collect(
 ) -> Fluxes:
     """What the fit needs of n media, kept in `folder` as it comes; progress: ("reflectances", media done, media)."""
     rng = np.random.default_rng([seed, 2])
-    albedo, g, eta = draw_media(n, rng)
-    eta = np.where(rng.random(n) < MATCHED, 1.0, eta)
-    ratios = np.stack([np.maximum(albedo, LEAST_ALBEDO), g, eta], axis=1)
-    mu_i = (np.arange(COSINES) + rng.random((n, COSINES))) / COSINES
+    ratios = _media(n, rng)
+    mu_i = ((np.arange(COSINES) + rng.random((n, COSINES))) / COSINES) ** STEEPNESS
     mu_i[:, -1] = np.where(rng.random(n) < 0.5, 1.0, mu_i[:, -1])  # normal incidence is asked for most
     results = []
     for at in range(0, n, CHUNK):
         media = range(at, min(at + CHUNK, n))
         place = folder / f"reflectances-{at // CHUNK:05d}.npy" if folder else None
         if place and place.exists():
-            rows = load_maps(place, (len(media), COSINES, 2 + INTERVALS))
+            rows = load_maps(place, (len(media), COSINES, 3 + INTERVALS))
         else:
             rows = np.stack([_row(hyper, ratios[k], mu_i[k], (seed, 3, k)) for k in media])  # no scramble is shared
             rows = rows.astype(np.float32)
@@ -96,27 +98,37 @@ def collect(
         results.append(rows)
         if progress:
             progress("reflectances", min(at + CHUNK, n), n)
-    exact, error, flux = np.split(np.concatenate(results).astype(np.float64), [1, 2], axis=2)
-    return Fluxes(ratios, mu_i, exact[..., 0], flux, error[..., 0])
+    exact, single, error, flux = np.split(np.concatenate(results).astype(np.float64), [1, 2, 3], axis=2)
+    return Fluxes(ratios, mu_i, exact[..., 0], single[..., 0], flux, error[..., 0])
+
+
+def _media(n: int, rng: np.random.Generator) -> np.ndarray:
+    """albedo, g and eta of media (n, 3): of the whole range, and more of those that the network is weakest for."""
+    albedo, g, eta = draw_media(n, rng)
+    u = rng.random((5, n))
+    steep = u[0] < STEEP
+    albedo = np.where(u[1] < 0.15, 1.0, np.maximum(albedo, LEAST_ALBEDO))
+    g = np.where(steep, np.minimum(1 - 0.018 * 7 ** u[2], RANGES["g"][1]), g)
+    nearly = np.where(u[3] < 0.8, 1 + 1e-3 * 100 ** u[4], eta)
+    return np.stack([albedo, g, np.where(u[3] < 0.45, 1.0, np.where(steep, nearly, eta))], axis=1)
 
 
 def _row(hyper: Hypernetwork, ratios: np.ndarray, mu_i: np.ndarray, seed: tuple[int, ...]) -> np.ndarray:
-    """Exact R, relative error and fluxes of a medium, (COSINES, 2 + INTERVALS)."""
+    """Exact R of all orders and of the single one, relative error and fluxes of a medium, (COSINES, 3 + INTERVALS)."""
     medium = Medium.from_albedo(ratios[0], 1.0, ratios[1], ratios[2])
     model = Trial(medium, hyper.network(*ratios.tolist()))
-    total = np.array([medium.reflectance(float(mu)) for mu in mu_i])
-    exact = np.maximum(total - single_scattering.reflectance(medium, mu_i), EXACT * total)
+    exact = np.array([medium.reflectance(float(mu)) for mu in mu_i])
+    single = np.minimum(single_scattering.reflectance(medium, mu_i), exact)
     flux, spread = _fluxes(model, mu_i, POINTS, seed)
     if (spread > NOISY * exact).any():
         flux, spread = _fluxes(model, mu_i, MORE * POINTS, seed)
-    error = np.hypot(spread, EXACT * total) / exact
-    return np.concatenate([exact[:, None], error[:, None], flux], axis=1)
+    return np.concatenate([np.stack([exact, single, spread / exact], axis=1), flux], axis=1)
 
 
 def _fluxes(model: Trial, mu_i: np.ndarray, points: int, seed: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Flux towards each interval and the standard error of their sum, for each cosine of incidence."""
     result = exits(model, np.repeat(mu_i, REPEATS).tolist(), points, seed)
-    interval = np.minimum((result.mu_o * INTERVALS).astype(int), INTERVALS - 1)
+    interval = np.minimum((result.mu_o ** (1 / STEEPNESS) * INTERVALS).astype(int), INTERVALS - 1)
     flux = np.stack([np.bincount(b, f, INTERVALS) for b, f in zip(interval, result.flux)])
     flux = flux.reshape(len(mu_i), REPEATS, INTERVALS)
     return flux.mean(axis=1), flux.sum(axis=2).std(axis=1, ddof=1) / np.sqrt(REPEATS)
@@ -144,11 +156,11 @@ class _Balance(nn.Module):
 
     def residual(self, batch: tuple[torch.Tensor, ...]) -> torch.Tensor:
         """log of the network's R with a over the exact one, (media, COSINES)."""
-        features, T_i, T_o, exact, flux, _ = batch
+        features, T_i, T_o, exact, single, flux, _ = batch
         c = self(features)
-        a_o = torch.exp(c @ T_o.T)
-        R = torch.einsum("nib,nb->ni", flux, a_o)
-        return torch.log(R / exact) + torch.einsum("nik,nk->ni", T_i, c)
+        a_o = torch.exp(torch.einsum("nbk,nk->nb", T_o, c))
+        R = torch.einsum("nib,nb->ni", flux, a_o) * torch.exp(torch.einsum("nik,nk->ni", T_i, c))
+        return torch.log((R + single) / exact)
 
     def loss(self, batch: tuple[torch.Tensor, ...]) -> torch.Tensor:
         off = self.residual(batch)
@@ -167,14 +179,15 @@ def _batches(data: Fluxes, size: int) -> Callable[[torch.Generator], tuple[torch
     usable = np.isfinite(data.error) & (data.flux.sum(axis=2) > 0)
     weight = np.where(usable, TRUSTED**2 / (TRUSTED**2 + np.where(usable, data.error, 1.0) ** 2), 0.0)
     flux = np.where(usable[..., None], data.flux, data.exact[..., None] / INTERVALS)
-    middles = (np.arange(INTERVALS) + 0.5) / INTERVALS
-    arrays = (chebyshev(data.mu_i), data.exact, flux, weight)
-    T_i, exact, flux, weight = (torch.from_numpy(np.asarray(v)).float() for v in arrays)
-    features, T_o = features.float(), torch.from_numpy(chebyshev(middles)).float()
+    aim = data.exact * (1 - BELOW * np.clip((data.exact - 1) / BRIGHT + 1, 0, 1) ** 2)
+    middles = np.broadcast_to(((np.arange(INTERVALS) + 0.5) / INTERVALS) ** STEEPNESS, (len(data.mu_i), INTERVALS))
+    T_i, T_o = (calibration_terms(mu, mu_internal(mu, data.ratios[:, 2:])) for mu in (data.mu_i, middles))
+    features, *arrays = (torch.from_numpy(np.asarray(v)).float()
+                         for v in (features, T_i, T_o, aim, data.single, flux, weight))  # fmt: skip
 
     def batch(generator: torch.Generator) -> tuple[torch.Tensor, ...]:
         n = torch.randint(len(features), (size,), generator=generator)
-        return features[n], T_i[n], T_o, exact[n], flux[n], weight[n]
+        return features[n], *(v[n] for v in arrays)
 
     return batch
 
