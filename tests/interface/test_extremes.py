@@ -82,7 +82,7 @@ def test_almost_no_absorption_tends_to_none(name, eta):
     np.testing.assert_allclose(*values, rtol=1e-4)
 
 
-@pytest.mark.parametrize("g", [0.0, 0.9])
+@pytest.mark.parametrize("g", [0.0, 0.8])
 def test_an_index_close_to_matched_tends_to_matched(name, g):
     points = (np.array([0.1, 1.0, 5.0]), 0.8, 0.3, 0.9, 0.0)
     values = [halfspace_sss.bssrdf(name, Medium.from_albedo(0.9, 1.0, g, eta)).eval(*points) for eta in (1 + 1e-6, 1.0)]
