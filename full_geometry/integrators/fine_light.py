@@ -38,7 +38,7 @@ LOST = 0.5  # root mean square of detail below the distance of points, over that
 
 
 class _Light(NamedTuple):
-    """At places: number of the nearest point, a mu E / (n p) and a mu E by channel, direction bent by the boundary."""
+    """Light at places: number of the nearest point, a mu E / (n p) and a mu E by channel, direction bent by the boundary."""
 
     near: np.ndarray
     value: np.ndarray
@@ -133,7 +133,7 @@ def _arriving(view: tuple, at: tuple, emitter: mi.Emitter) -> tuple[np.ndarray, 
 
 
 def _by_rays(view: tuple, emitter: mi.Emitter) -> _Light:
-    """Of places that rays of an emitter meet."""
+    """The light at places that rays of an emitter meet."""
     scene, instance_scene, obj, T = view
     u = [mi.Float(v.astype(np.float32)) for v in lattice(COUNT, roots=ROOTS, shift=[0.5] * 4)]
     ray, flux = emitter.sample_ray(0.0, 0.5, mi.Point2f(u[0], u[1]), mi.Point2f(u[2], u[3]), True)
