@@ -38,7 +38,7 @@ LOST = 0.5  # root mean square of detail below the distance of points, over that
 
 
 class _Light(NamedTuple):
-    """Light at places: number of the nearest point, a mu E / (n p) and a mu E by channel, direction bent by the boundary."""
+    """Light at places: number of the nearest point, a mu E / (n p) and a mu E by channel, and its bent direction."""
 
     near: np.ndarray
     value: np.ndarray
