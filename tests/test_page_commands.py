@@ -33,8 +33,7 @@ LESS = {  # what a command is given beside, by the longest of these that it star
     "fit": "--steps 2 --spp 2",
     "train object": "--seconds 1",
     "train material": "--steps 20",
-    "train material ketchup": "--channel R --steps 20",
-    "train material fig10 --model neural_paper": "--steps 20",
+    "train material ketchup": "--channel R --fast --steps 20",
     "trade scene.xml": "--assess 0.1",
     "trade ball.xml": "--assess 0.1",
     "trade scene.xml --train-seconds": "--assess 0.1 --train-seconds 1",
@@ -52,6 +51,7 @@ LESS = {  # what a command is given beside, by the longest of these that it star
 }
 UNDERSTOOD = {  # by their beginnings, why
     "train universal": "half an hour",
+    "train material fig10 --model neural_paper": "minutes for its maps",
     "train shapes": "an hour",
     "figures all --quality draft": "15 minutes",
     "figures all fig09 fig10 --scheduler": "a scheduler",

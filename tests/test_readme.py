@@ -11,6 +11,7 @@ from pathlib import Path
 import command_list
 import pytest
 import typer
+from test_page_commands import PAGES as IN_ORDER
 
 from benchmarks.__main__ import app as studies
 from figures import app as cli
@@ -22,7 +23,7 @@ BLOCKS = {page: re.findall(r"^```(\w+)\n(.*?)^```", text, flags=re.M | re.S) for
 SNIPPETS = {
     page: [text for language, text in blocks if language == "python"]
     for page, blocks in BLOCKS.items()
-    if any(language == "python" for language, _ in blocks)
+    if page not in IN_ORDER and any(language == "python" for language, _ in blocks)
 }
 SNIPPETS |= {  # scripts with cells, whole
     str(path.relative_to(ROOT)): [path.read_text(encoding="utf-8")]
