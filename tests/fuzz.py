@@ -429,7 +429,7 @@ def scene_file(rng: Random, folder: Path) -> None:
 
 
 def render(rng: Random, folder: Path) -> None:
-    """An image of 4 x 4 pixels of the first scene of ours that loads: finite and not negative."""
+    """An image of 4 x 4 pixels of the first scene of ours that loads: finite, and not negative by models."""
     import mitsuba as mi
 
     for _ in range(40):
@@ -441,7 +441,9 @@ def render(rng: Random, folder: Path) -> None:
         except RefusedError:
             continue
         image = np.array(ask(mi.render, scene, spp=4))
-        assert np.isfinite(image).all() and (image >= 0).all(), (text, image)
+        assert np.isfinite(image).all(), (text, image)
+        signed = "translucent_walk" in text or "corrected" in text  # estimators of few samples, with control variates
+        assert signed or (image >= 0).all(), (text, image)
         return
     raise RefusedError("no scene in 40 loads")
 

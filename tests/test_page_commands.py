@@ -24,7 +24,7 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = ["README.md", *(f"docs/{name}.md" for name in (
     "start", "materials", "curves", "tracing", "rendering", "light", "learnt_models", "inverse", "trade", "train",
-    "cluster", "plugins", "biomedical", "errors", "figures", "choosing", "add_model",
+    "cluster", "plugins", "biomedical", "errors", "figures", "add_model",
 ))]  # fmt: skip
 LESS = {  # what a command is given beside, by the longest of these that it starts with
     "curves": "--paths 20000 --theta-i 0",
@@ -36,7 +36,6 @@ LESS = {  # what a command is given beside, by the longest of these that it star
     "train material ketchup": "--channel R --fast --steps 20",
     "trade scene.xml": "--assess 0.1",
     "trade ball.xml": "--assess 0.1",
-    "trade scene.xml --train-seconds": "--assess 0.1 --train-seconds 1",
     "errors materials": "--events 1e5 --channel R --model better_dipole",
     "errors materials --held-out": "--events 1e5 --held-out 2",
     "errors object": "--exits 16",

@@ -339,6 +339,7 @@ def _incident(
     values += [TRACED * more, *(TRACED * more * d_c[i] for i in range(3)), TRACED * dr.select(on, a, 0)]
     values = [mi.Spectrum(v) + dr.zeros(mi.Float, rows * n) for v in values]
     each_light = [mi.Spectrum(v) + dr.zeros(mi.Float, rows * n) for v in (aimed, met)]
+    w_e += dr.zeros(mi.Float, rows * n)  # without an emitter it has one lane
     dr.eval(values, each_light, w_e, w_c)
 
     # ---- lanes in the order of rows and directions again

@@ -174,8 +174,9 @@ def test_light_that_is_not_finite_is_refused_by_emitter_and_texel(integrator: st
         mi.render(scene, integrator=found, spp=1)
 
 
-def test_black_light_leaves_a_mesh_of_few_faces_black() -> None:
-    scene = _scene("gathered", lights={"sky": {"type": "constant", "radiance": 0.0}}, shape={"type": "cube"})
+@pytest.mark.parametrize("lights", [{"sky": {"type": "constant", "radiance": 0.0}}, {}])
+def test_black_light_and_none_leave_a_mesh_of_few_faces_black(lights: dict) -> None:
+    scene = _scene("gathered", lights=lights, shape={"type": "cube"})
     assert not np.any(_image(scene, 4))
 
 
