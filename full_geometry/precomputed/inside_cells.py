@@ -207,7 +207,7 @@ def brick_counts(box: tuple[np.ndarray, np.ndarray], h: float) -> np.ndarray:
 def cell_edge(
     box: tuple[np.ndarray, np.ndarray], extent: Callable[[], tuple[float, float]], h: float, depths: tuple[float, float]
 ) -> float:
-    """h, or the least edge by which an object has no more than MOST_BRICKS and MOST_SLOTS.
+    """h, or the least edge of cells that gives an object at most MOST_BRICKS and MOST_SLOTS.
 
     Args:
         box: its least and largest coordinates.

@@ -147,6 +147,7 @@ def unscattered_light(
     index = CellIndex(_joined(bricks), _joined(slots))
     light = _joined(fluence), _joined(directions) if directional else None
     dr.make_opaque(tables, index, light)
+    dr.sync_thread()  # callers time this
     return UnscatteredLight(index, *light, tables, forward(media))
 
 
