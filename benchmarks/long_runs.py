@@ -10,7 +10,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from full_geometry.geometry.sensors import seeded
 from full_geometry.trade.assessing import assess_stage
@@ -26,23 +25,6 @@ STEADY = 0.15  # relative standard error of variances
 FIRST, LATER = 0.4, 0.6  # share of walks in the time of a batch
 
 
-def assessment_of(record: dict[str, Any]) -> Assessment:
-    """Read an assessment from its `record`."""
-    objects = []
-    for o in record["objects"]:
-        rows = tuple(TechniqueTrade(**{key: _known(key, value) for key, value in w.items()}) for w in o["ways"])
-        lists = {key: tuple(o[key]) for key in ("mfp", "radiance", "notes")}
-        objects.append(ObjectTrade(**{**o, **lists, "ways": rows}))
-    return Assessment(tuple(objects), record["seconds"], record["compilation"], record["seed"])
-
-
-def _known(key: str, value: object) -> object:
-    """A field of a `TechniqueTrade` from JSON."""
-    if key in ("ratio", "ratio_error"):
-        return tuple(math.nan if v is None else v for v in value)
-    return math.nan if value is None and key not in ("flip", "flip_noise") else value
-
-
 def long_run(
     on: Stage, ways: Sequence[Technique], tolerance: float, path: Path, seed: int, seconds: float
 ) -> Assessment:
@@ -54,13 +36,14 @@ def long_run(
         if how.items() <= kept.items():
             batches = kept["batches"]
     while True:
-        result = mean_of([assessment_of(b) for b in batches]) if batches else None
+        result = mean_of([Assessment.from_record(b) for b in batches]) if batches else None
         names = _open(result.objects[0], tolerance) if result else [way.name for way in ways]
         if result and (not names or len(batches) * BATCH >= seconds):
             return result
         few = [way for way in ways if way.name in names or way.walks]
         traced = LATER if batches else FIRST
-        batch = assess_stage(on, few, Effort(min(BATCH, seconds), seed=seeded(seed, len(batches)), traced=traced))
+        effort = Effort(min(BATCH, seconds), seed=seeded(seed, len(batches)), traced=traced)
+        batch = assess_stage(on, few, effort, tolerance=tolerance)
         batches.append(batch.record())
         write_atomically(path, json.dumps({**how, "batches": batches, "provenance": provenance(**how)}) + "\n")
 

@@ -114,7 +114,8 @@ def _xml(scene: RandomScene, mesh: str) -> str:
   </shape>
   <sensor type="perspective"><float name="fov" value="30"/>
     <transform name="to_world"><lookat origin="{origin}" target="0, 0, 0" up="0, 1, 0"/></transform>
-    <film type="hdrfilm"><integer name="width" value="{FILM}"/><integer name="height" value="{FILM}"/></film>
+    <film type="hdrfilm"><integer name="width" value="{FILM}"/><integer name="height" value="{FILM}"/>
+      <rfilter type="box"/></film>
   </sensor>
 </scene>
 """

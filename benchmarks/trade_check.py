@@ -6,40 +6,43 @@ import json
 import math
 from pathlib import Path
 
-from benchmarks.long_runs import assessment_of, long_run
+from benchmarks.long_runs import long_run
 from benchmarks.random_scenes import RandomScene, write_scene
 from full_geometry.geometry.sensors import seeded
 from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.trade.advice import advise
-from full_geometry.trade.assessing import assess_for, learn
-from full_geometry.trade.automatic import picked
-from full_geometry.trade.results import TechniqueTrade
-from full_geometry.trade.techniques import Effort, Job, Stage, Technique, stage
-from halfspace_sss.neural.store import weights_in
+from full_geometry.trade.assessing import assess_for, corrected_chance
+from full_geometry.trade.results import Assessment, TechniqueTrade
+from full_geometry.trade.techniques import (
+    CORRECTED,
+    DENOISED_WALKS,
+    PRECOMPUTED_WALKS,
+    READY_FIRST,
+    WALKS,
+    Effort,
+    Job,
+    Stage,
+    Technique,
+    stage,
+)
 from halfspace_sss.provenance import provenance, write_atomically
 
 WAYS = (
-    PATH_TRACED, "lambert", "better_dipole", "neural", "full_geometry",
-    "better_dipole, gathered", "neural, gathered", "full_geometry, gathered",
+    *(way.name for way in (WALKS, PRECOMPUTED_WALKS, *DENOISED_WALKS)), "lambert",
+    f"{READY_FIRST}, {CORRECTED}",
 )  # fmt: skip
-LEARNT = "full_geometry"
-TRAIN_SECONDS = 20.0
-FORMAT = "halfspace-sss trade check 7"
+UNLIKELY = 0.1  # chance to keep the tolerance, below which corrected light has no long run
+FORMAT = "halfspace-sss trade check 8"
 
 
 def check_scene(scene: RandomScene, folder: Path, seconds: float, truth_seconds: float) -> dict[str, object]:
-    """The record of a scene: the assessment, and the mean of long runs; what the folder holds is not run again.
-
-    Its object is learnt before, which is a cost of the model that needs it.
-    """
+    """The record of a scene: the assessment, and the mean of long runs; what the folder holds is not run again."""
     file = write_scene(scene, folder)
     on, ways = stage(file), [Technique.of(name) for name in WAYS]
-    with weights_in(folder / "weights"):
-        if any(way.model == LEARNT for way in ways):
-            learn(on, TRAIN_SECONDS)
-        quick = _quick(scene, on, ways, file.with_suffix(".json"), seconds)
-        truth = file.with_suffix(".truth.json")
-        long = long_run(on, ways, scene.tolerance, truth, seeded(scene.seed, scene.number, 1), truth_seconds)
+    quick = _quick(scene, on, ways, file.with_suffix(".json"), seconds)
+    truth = file.with_suffix(".truth.json")
+    likely = [way for way in ways if way.light != CORRECTED or corrected_chance(scene.tolerance) > UNLIKELY]
+    long = long_run(on, likely, scene.tolerance, truth, seeded(scene.seed, scene.number, 1), truth_seconds)
     return {"scene": scene.record(), "quick": quick, "long": long.record()}
 
 
@@ -60,7 +63,7 @@ def _quick(scene: RandomScene, on: Stage, ways: list[Technique], path: Path, sec
 def outcome(record: dict[str, object]) -> dict[str, object]:
     """What came of a scene: error and cost of the recommendation by the long runs, and those of the cheapest way."""
     scene = RandomScene(**{k: tuple(v) if isinstance(v, list) else v for k, v in record["scene"].items()})
-    quick, long = (assessment_of(record[key]) for key in ("quick", "long"))
+    quick, long = (Assessment.from_record(record[key]) for key in ("quick", "long"))
     results: dict[str, object] = {"number": scene.number, "shape": scene.shape, "light": scene.light, "mfp": scene.mfp}
     results |= {"tolerance": scene.tolerance, "images": scene.images, "seconds": quick.seconds}
     if not quick.objects[0].ways or quick.objects[0].is_dark:
@@ -70,24 +73,20 @@ def outcome(record: dict[str, object]) -> dict[str, object]:
     option = chosen.options[0]
     truth = {row.way: row for row in long.objects[0].ways if not row.refusal}
     row, pixels = truth[option.way], long.objects[0].pixels
-    error2 = max(row.bias2, 0.0) + row.variance / option.spp
+    fewer = max(row.least / option.spp, 1.0)  # of denoised walks, whose error is that of `least` samples
+    error2 = max(row.bias2, 0.0) * fewer + row.variance / option.spp
     error2_error = math.hypot(row.bias2_error, row.variance_error / option.spp)
     least = {name: _least(w, scene, pixels) for name, w in truth.items()}
     cheapest = min(least, key=lambda name: least[name])
     known = [name for name, w in truth.items() if w.bias2 + 2 * w.bias2_error < scene.tolerance**2]
     sure = min((least[name] for name in known), default=math.inf)
     cost = row.training + row.preparation + scene.images * pixels * option.spp * row.seconds
-    automatic = picked(quick.objects[0], scene.tolerance).model
     results |= {"way": option.way, "spp": option.spp, "error": math.sqrt(error2)}
     results |= {"error_standard_error": error2_error / (2 * math.sqrt(error2)), "cost_s": cost}
     results |= {"cheapest": cheapest, "cheapest_s": least[cheapest], "ratio": cost / least[cheapest]}
     results |= {"sure_ratio": cost / sure}
-    results |= {"keeps": error2 - 2 * error2_error <= scene.tolerance**2, "auto": automatic}
-    return (
-        results
-        | {f"{name}_s": least.get(name, math.inf) for name in (PATH_TRACED, "neural", "better_dipole")}
-        | {"auto_s": least.get(automatic, math.inf)}
-    )
+    results["keeps"] = error2 - 2 * error2_error <= scene.tolerance**2
+    return results | {f"{name}_s": least.get(name, math.inf) for name in WAYS}
 
 
 def _least(row: TechniqueTrade, scene: RandomScene, pixels: float) -> float:
@@ -95,12 +94,16 @@ def _least(row: TechniqueTrade, scene: RandomScene, pixels: float) -> float:
     left = scene.tolerance**2 - max(row.bias2, 0.0)
     if not left > 0:
         return math.inf
-    return row.training + row.preparation + scene.images * pixels * max(math.ceil(row.variance / left), 1) * row.seconds
+    return (
+        row.training
+        + row.preparation
+        + scene.images * pixels * max(math.ceil(row.variance / left), row.least) * row.seconds
+    )
 
 
 def z_values(record: dict[str, object]) -> list[tuple[str, float]]:
     """(bias² of the assessment - that of the long run) over their standard errors together, for each way."""
-    quick, long = (assessment_of(record[key]) for key in ("quick", "long"))
+    quick, long = (Assessment.from_record(record[key]) for key in ("quick", "long"))
     results = []
     for a in quick.objects[0].ways:
         if a.refusal or a.way == PATH_TRACED:

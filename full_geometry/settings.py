@@ -38,12 +38,10 @@ class Settings:
             leaves it to the model.
         light: "sampled", without bias beside that of the model; "gathered" once for all samples, see
             `integrators.gathering`: scattered light has no noise, and a little more bias; "corrected", gathered and
-            then corrected by random walks, see `integrators.correction`; or "auto", the cheaper of the first two that
-            keeps the tolerance, by measurement.
+            then corrected by random walks, see `integrators.correction`; or "auto", the cheapest of these that keeps
+            the tolerance, by measurement.
         hide_emitters: whether directly visible emitters are left out.
-        tolerance: relative error of the radiance of an object that its model "auto" keeps, if one does.
-        choice_share: of the samples of the first sensor's image, that the choice of "auto" may take; see
-            `trade.automatic`.
+        tolerance: relative error of the radiance of an object that its model "auto" keeps; see `trade.automatic`.
         model, orders: of all objects, instead of what their surfaces say, where they are given.
     """
 
@@ -56,14 +54,12 @@ class Settings:
     hide_emitters: bool = False
     light: str = "sampled"
     tolerance: float = 0.05
-    choice_share: float = 0.1
     model: str = ""
     orders: str = ""
 
     def __post_init__(self) -> None:
         check_interval("mm_per_unit", self.mm_per_unit, *MM_PER_UNIT)
         check_interval("tolerance", self.tolerance, 1e-4, 10.0)
-        check_interval("choice_share", self.choice_share, 0.0, 1.0)
         if self.max_depth < -1 or self.max_depth == 0:
             raise ValueError(f"max_depth must be -1 or at least 1, got {self.max_depth}")
         if self.rr_depth < 1:
@@ -190,7 +186,7 @@ class Choices(NamedTuple):
 
     Args:
         models: by number among the translucent objects of the scene, of those whose model is "auto".
-        light: "sampled" or "gathered".
+        light: of models, "sampled", "gathered" or "corrected".
         sentences: why, by id of the object.
     """
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from full_geometry.scenes.reference import Limits
     from full_geometry.scenes.reference_store import Picture, Reference
 
-SPP = 64
+SPP, ASKED = 64, 0.02  # samples of a pixel of what is named, relative error of what is not
 ENDINGS = ("png", "html", "denoised.exr", "denoised.png")  # of what is drawn
 PHASES = ("walks.exr", "walks.json", "model.exr", "model.json")  # of an image with walks in it
 RenderVariant = Annotated[
@@ -38,7 +38,10 @@ class UntilOptions:
         int | None,
         typer.Option(help="Samples for each pixel.", parser=shared.whole, show_default="64, or another end"),
     ] = None
-    target_error: Annotated[float | None, typer.Option(help="Stop at this relative error; 0.02 is 2 %.")] = None
+    target_error: Annotated[
+        float | None,
+        typer.Option(help="Stop at this relative error; 0.02 is 2 %.", show_default="0.02 where nothing names a model"),
+    ] = None
     seconds: Annotated[float | None, typer.Option(help="Stop after this time of rendering.")] = None
 
     def limits(self) -> Limits:
@@ -54,7 +57,10 @@ class TransportOptions:
 
     model: Annotated[
         str | None,
-        typer.Option(help="A model for all objects, auto, or path_traced.", show_default="as the scene says"),
+        typer.Option(
+            help="A model for all objects, auto, or path_traced.",
+            show_default="as the scene says, or the cheaper of walks and corrected light",
+        ),
     ] = None
     orders: Annotated[
         Literal["total", "multiple", "single"] | None,
@@ -121,13 +127,14 @@ def render(
     from halfspace_sss.locks import one_writer
     from halfspace_sss.provenance import check_folder
 
-    limits, parameters = until.limits(), shared.defined(define)
+    until.limits()  # refuses what is out of range, before any work
     drawers = _drawers(context, images.denoise)
     check_folder(out)
-    loaded = _opened(scene, transport, parameters, images.denoise)
+    way = _way(scene, transport, until, shared.defined(define), (images.denoise, drawers is not None))
+    loaded, limits = way.scene, way.limits
     sensors = _sensors(images.sensor, loaded)
     shared.say(*chosen(loaded, loaded.integrator()).get("choices", {}).values())
-    if images.denoise and any(not loaded.sensors()[k].film().rfilter().is_box_filter() for k in sensors):
+    if way.denoise and any(not loaded.sensors()[k].film().rfilter().is_box_filter() for k in sensors):
         shared.tell(
             "the film has no box filter: the denoiser keeps most of the noise that other filters spread over pixels"
         )
@@ -136,7 +143,7 @@ def render(
         file = out / f"{'_'.join(filter(None, name))}.exr"
         with one_writer(file):
             which = {"seed": images.seed, "sensor": k, **transport.training()}
-            denoise = Denoiser(loaded, k) if images.denoise else None
+            denoise = Denoiser(loaded, k) if way.denoise else None
             result = _rendered(loaded, file, limits, {**which, "denoise": denoise}, images.resume)
             clean = cross_denoised(result, denoise) if denoise else None
             told, error = _numbers(result), _error(result, limits.target_error or SMALL_ERROR)
@@ -165,25 +172,66 @@ def _off(scene: mi.Scene, image: np.ndarray, sensor: int, model: str | None) -> 
         return [f"the error of models is unknown, as random walks refuse the scene: {first_cause(error)}"]
 
 
-def _opened(scene: Path, transport: TransportOptions, parameters: dict[str, str], denoise: bool) -> mi.Scene:
-    """The scene; where all models are "auto" by walks, if these are the cheapest that keep the tolerance."""
+@dataclass(frozen=True)
+class _Way:
+    """A scene as it is rendered, what ends that, and whether it is denoised."""
+
+    scene: mi.Scene
+    limits: Limits
+    denoise: bool
+
+
+def _way(
+    scene: Path, transport: TransportOptions, until: UntilOptions, parameters: dict[str, str],
+    denoising: tuple[bool, bool],
+) -> _Way:  # fmt: skip
+    """The scene by what is named, or by the cheapest way that keeps the asked error: of all for the model "auto".
+
+    Where neither scene nor options name anything, and an error or no end at all is asked for, it is the cheapest of
+    walks and light that is corrected by them.
+
+    Args:
+        denoising: whether it is asked for, and whether it can be.
+    """
     import mitsuba as mi
 
     from full_geometry.integrators.bssrdf import is_bssrdf
-    from full_geometry.scenes.scene_files import open_scene
-    from full_geometry.settings import AUTO, PATH_TRACED
-    from full_geometry.trade.automatic import models_of, walks_instead
+    from full_geometry.objects.objects import translucent_shapes
+    from full_geometry.scenes.scene_files import names_nothing, open_scene
+    from full_geometry.settings import AUTO, PATH_TRACED, Settings
+    from full_geometry.trade.automatic import UNNAMED, decided, models_of, ways_of
+    from full_geometry.trade.techniques import READY_FIRST, Technique
 
-    settings = transport.settings(denoise)
+    # ---- what is asked for, and whether it is left to us
+    denoise, error, ended = denoising[0], until.target_error, (until.spp, until.seconds) != (None, None)
+    settings = {**({"light": AUTO} if transport.model == AUTO else {}), **transport.settings(denoise)}
+    if transport.model == AUTO and error:
+        settings["tolerance"] = error
     loaded = open_scene(scene, transport.model, transport.orders, parameters, settings)
-    integrator = loaded.integrator()
-    if mi.is_spectral or not is_bssrdf(integrator) or set(models_of(loaded, integrator.settings)) != {AUTO}:
-        return loaded
-    light, why = walks_instead(loaded, integrator.settings)
-    if not light:
-        return loaded
-    shared.say(why)
-    return open_scene(scene, PATH_TRACED, transport.orders, parameters, {**settings, "light": light})
+    integrator, named = loaded.integrator(), (transport.model, transport.orders, transport.light)
+    by_models = is_bssrdf(integrator) and set(models_of(loaded, integrator.settings)) == {AUTO}
+    unnamed = named == (None, None, None) and (error or not ended) and names_nothing(scene, parameters)
+    unnamed &= all(any(shape is each for each in loaded.shapes()) for shape in translucent_shapes(loaded))
+    if mi.is_spectral or not (by_models or unnamed):
+        return _Way(loaded, until.limits(), denoise)
+
+    # ---- the way, and what ends it
+    how = integrator.settings if by_models else Settings(mm_per_unit=integrator.mm_per_unit, tolerance=error or ASKED)
+    ways = ways_of([AUTO], how.light) if by_models else UNNAMED
+    ways = [way for way in ways if denoising[1] or not Technique.of(way).denoised]
+    found = decided(loaded, how, ways)
+    shared.say(found.why)
+    limits = until.limits()
+    if not ended and found.spp is None:
+        limits = replace(limits, spp=None, target_error=how.tolerance)
+    elif not ended and not (found.walks and error):  # an error that is asked for is told of walks while they go on
+        limits = replace(limits, spp=found.spp, target_error=None)
+    if by_models and found.walks is None:  # the integrator finds again which models these are
+        return _Way(loaded, limits, denoise)
+    denoise |= found.walks is not None and found.walks.denoised
+    settings = {**transport.settings(denoise), "light": found.light}
+    model = PATH_TRACED if found.walks else READY_FIRST
+    return _Way(open_scene(scene, model, transport.orders, parameters, settings), limits, denoise)
 
 
 def _sensors(text: str, scene: mi.Scene) -> list[int]:

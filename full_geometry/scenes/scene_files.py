@@ -180,6 +180,13 @@ def open_scene(
     return loaded
 
 
+def names_nothing(scene: dict | str | Path, parameters: Mapping[str, str] | None = None) -> bool:
+    """Whether a scene has no integrator and names no model, so that what renders it is left to us."""
+    state, _ = parsed(scene, parameters or {})
+    integrators = any(node.type == mi.ObjectType.Integrator for node in state.nodes)
+    return not integrators and not any("model" in props for props in _surfaces(state))
+
+
 def _set_parameters(state: ParserState, plugin: str, settings: Mapping[str, float | str]) -> None:
     for node in state.nodes if settings else ():
         if node.props.plugin_name() == plugin:

@@ -21,7 +21,7 @@ from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.settings import GATHERED_LIGHTS
 from full_geometry.trade.assessing import assess
 from full_geometry.trade.results import UNNAMED, Assessment, ObjectTrade, TechniqueTrade, html_table, samples_for
-from full_geometry.trade.techniques import CORRECTED, LAMBERT, PRECOMPUTED_WALKS, Job, Technique
+from full_geometry.trade.techniques import CORRECTED, DENOISED_WALKS, LAMBERT, PRECOMPUTED_WALKS, Job, Technique
 from halfspace_sss.noise_free import short
 
 if TYPE_CHECKING:
@@ -63,11 +63,12 @@ class Advice:
 
     Attributes:
         objects: for each object alone.
-        integrator: "path_traced", "path_traced, precomputed", "bssrdf" or "bssrdf, gathered", which serves all objects
-            at once in the least time.
+        integrator: "path_traced", "bssrdf", either with its light, and of walks "denoised", which serves all objects at
+            once in the least time.
         seconds: that it takes.
         assessment: what this rests on.
         tolerance: that was asked.
+        spp: samples of a pixel, the most of all objects.
     """
 
     objects: tuple[ObjectAdvice, ...]
@@ -75,6 +76,7 @@ class Advice:
     seconds: float
     assessment: Assessment
     tolerance: float
+    spp: int = 0
 
     def __repr__(self) -> str:
         ways = ", ".join(f"{each.object or UNNAMED}: {each.way}" for each in self.objects)
@@ -129,19 +131,17 @@ def advise(assessment: Assessment, job: Job) -> Advice:
     """The ways for a job, from what has been measured."""
     objects = tuple(_object(o, job) for o in assessment.objects)
     told = [o for o in objects if o.way is not None]
-    kinds = (
-        INTEGRATOR,
-        *(f"{INTEGRATOR}, {light}" for light in GATHERED_LIGHTS),
-        PATH_TRACED,
-        PRECOMPUTED_WALKS.name,
-    )
-    times = {kind: sum(_best(o, kind) for o in told) for kind in kinds}
+    models = (INTEGRATOR, *(f"{INTEGRATOR}, {light}" for light in GATHERED_LIGHTS))
+    walks = (PATH_TRACED, PRECOMPUTED_WALKS.name, *(each.name for each in DENOISED_WALKS))
+    best = {kind: [_best(o, kind) for o in told] for kind in (*models, *walks)}
+    times = {kind: sum(option.seconds for option in options) for kind, options in best.items()}
     integrator = min(times, key=lambda kind: times[kind])
-    return Advice(objects, integrator, times[integrator], assessment, job.tolerance)
+    spp = max((option.spp for option in best[integrator]), default=0)
+    return Advice(objects, integrator, times[integrator], assessment, job.tolerance, spp)
 
 
-def _best(advice: ObjectAdvice, kind: str) -> float:
-    """Least seconds of an object by an integrator; what does not spread is the same in both kinds of light."""
+def _best(advice: ObjectAdvice, kind: str) -> Option:
+    """The fastest of an object by an integrator; what does not spread is the same in sampled and gathered light."""
 
     def served(technique: Technique) -> bool:
         if technique.walks or kind.startswith(PATH_TRACED):
@@ -149,7 +149,8 @@ def _best(advice: ObjectAdvice, kind: str) -> float:
         light = kind.removeprefix(INTEGRATOR).removeprefix(", ") or "sampled"
         return technique.light == light or (technique.model == LAMBERT and light != CORRECTED)
 
-    return min((o.seconds for o in advice.options if o.way and served(Technique.of(o.way))), default=math.inf)
+    options = [o for o in advice.options if o.way and served(Technique.of(o.way))]
+    return min(options, key=lambda o: o.seconds, default=Option("", math.inf, 0, math.nan, ""))
 
 
 def _object(assessed: ObjectTrade, job: Job) -> ObjectAdvice:

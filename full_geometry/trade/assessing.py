@@ -4,25 +4,31 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from statistics import NormalDist
 from typing import Any
 
 import mitsuba as mi
+import numpy as np
 
 from full_geometry.geometry.sensors import seeded
+from full_geometry.integrators.correction import FEWEST as FEWEST_WALKS
 from full_geometry.integrators.gathering import PART
 from full_geometry.learning.learners import Learner, learner
 from full_geometry.scenes.reference import check_sensor
 from full_geometry.scenes.scene_files import PATH_TRACED, first_cause
-from full_geometry.trade.images import with_flip
-from full_geometry.trade.measuring import OWN_SHARE, RunBudget, SceneSamples
+from full_geometry.trade.images import TILE, TILES, DenoisingBudget, denoised_rows, with_flip
+from full_geometry.trade.measuring import RunBudget, SceneSamples
 from full_geometry.trade.results import Assessment, ObjectTrade, TechniqueTrade, samples_for
 from full_geometry.trade.techniques import (
+    CORRECTED,
+    DENOISED_WALKS,
     GATHERED,
     PRECOMPUTED_WALKS,
+    READY_FIRST,
     TRACED_SHARE,
     WALKS,
     Effort,
@@ -38,13 +44,15 @@ from halfspace_sss.progress import NamedProgress
 
 MOST = 384  # points for a tolerance
 WALKED_FIRST = 0.15  # seconds of walks that tell how many points and which techniques are worth a run
+DENOISED_SHARE = 0.25  # of the time, for small images that are denoised
 FIRST_SHARE = 0.45  # of the time, for the first run of all techniques
 LEAST_SHARE = 0.25  # of the time, for walks and what may win against them, however long all else takes
 LAST_SHARE = 0.1  # likewise, after light has been gathered
 KNOWN = 0.1  # standard error of a bias² over the squared tolerance that is enough
 CANDIDATES = (
-    PATH_TRACED, PRECOMPUTED_WALKS.name, "lambert", "better_dipole", "neural", "full_geometry", "neural_shape",
-    *(f"{name}, {GATHERED}" for name in ("better_dipole", "neural", "full_geometry", "neural_shape")),
+    PATH_TRACED, PRECOMPUTED_WALKS.name, *(each.name for each in DENOISED_WALKS), "lambert", READY_FIRST, "neural",
+    "full_geometry", "neural_shape", f"{READY_FIRST}, {CORRECTED}",
+    *(f"{name}, {GATHERED}" for name in (READY_FIRST, "neural", "full_geometry", "neural_shape")),
 )  # fmt: skip
 DEAR = ("neural_shape",)  # to run, which takes DEAR_SECONDS
 
@@ -64,8 +72,8 @@ def assess(
 
     At points of an object that the camera sees, radiance by each technique is compared with that by random walks, with
     the noise of both taken out; time is that of the same samples. Lights, reflections and other objects are those of
-    the scene, at its own largest depth. For a job, biases under an environment map are measured by a smoothed one, see
-    `SmoothedEnvironment`; the map of a loaded scene is edited meanwhile, and put back.
+    the scene, at its own largest depth. Walks that tell biases have precomputed light where that is possible and among
+    the techniques; its own bias, 1 % at a point, counts as doubt. Denoised walks are measured on small images.
 
     Args:
         scene: a Mitsuba scene, a dict as for `mitsuba.load_dict`, or the path of an XML file.
@@ -109,12 +117,17 @@ def _chosen(models: Sequence[str] | None) -> list[Technique]:
 
 
 def assess_stage(
-    on: Stage, chosen: Sequence[Technique], effort: Effort, progress: NamedProgress | None = None
-) -> Assessment:
-    """As `assess`, of a scene that is made ready, with the time shared by all techniques alike."""
+    on: Stage, chosen: Sequence[Technique], effort: Effort, progress: NamedProgress | None = None,
+    tolerance: float | None = None,
+) -> Assessment:  # fmt: skip
+    """As `assess`, of a scene that is made ready, with the time shared by all techniques alike.
+
+    Denoised walks have the fewest samples that keep a tolerance, or the most that were measured.
+    """
     samples = SceneSamples.of(on, chosen, effort)
     budget = RunBudget(effort.seconds, effort.samples, effort.traced)
-    samples.run(chosen, budget, seeded(effort.seed, 42), progress)
+    samples.run([t for t in chosen if not t.denoised], budget, seeded(effort.seed, 42), progress)
+    _denoise(samples, chosen, effort.seconds, tolerance, True)
     return samples.assessment()
 
 
@@ -125,31 +138,22 @@ def assess_for(
     """As `assess_stage`, with most of the time for techniques that could be the cheapest to keep a tolerance.
 
     Techniques that cannot be the cheapest for the job are left out by what few samples of others say; with `every` all
-    are measured. The time is that of all that is done, and points are fewer where walks are noisy. Biases are known by
-    a smoothed environment, see `SmoothedEnvironment`.
+    are measured. The time is that of all that is done, and points are fewer where walks are noisy.
     """
-    with on.with_smoothed_environment() as smoothed:
-        return _assessed_for(smoothed, chosen, job, effort, every, progress)
-
-
-def _assessed_for(
-    on: Stage, chosen: Sequence[Technique], job: Job, effort: Effort, every: bool, progress: NamedProgress | None
-) -> Assessment:
     dear = DEAR if effort.seconds < DEAR_SECONDS else ()
     later = [t for t in chosen if not every and (t.gathers or t.model in dear)]
-    ahead = [t for t in chosen if t not in later]
+    ahead = [t for t in chosen if t not in later and not t.denoised]
     exits = effort.exits if every else min(effort.exits, MOST)
     samples = SceneSamples.of(on, ahead, replace(effort, exits=exits))
 
     def run(chosen: Sequence[Technique], number: int, budget: RunBudget | None = None) -> None:
         samples.run(chosen, budget or RunBudget(), seeded(effort.seed, number), progress)
 
-    # Run walks twice, as the first launch tells little of time, and smooth the environment only where that helps them.
-    run([WALKS], 46)
-    run([WALKS], 44, RunBudget(WALKED_FIRST))
-    if on.smoothed and not samples.smoothing_pays():
-        samples.drop_smoothing()
-        run([WALKS], 47, RunBudget(WALKED_FIRST))
+    # Run walks twice, as the first launch tells little of time.
+    walks = [t for t in ahead if t.walks]
+    run(walks, 46)
+    run(walks, 44, RunBudget(len(walks) * WALKED_FIRST, traced=1 / len(walks)))
+    _denoise(samples, chosen, effort.seconds, job.tolerance, every)
     out: dict[Technique, str] = {}
     if every:
         run(ahead, 42, RunBudget(FIRST_SHARE * effort.seconds, traced=TRACED_SHARE))
@@ -164,25 +168,29 @@ def _assessed_for(
         run(flat[:1], 45)
         out |= as_far_off(samples.assessment(), flat, later, job.tolerance)
         ahead, later = ([t for t in some if t not in out] for some in (ahead, later))
-        run([t for t in ahead if not t.exact and t not in flat[:1]], 43)
+        run([t for t in ahead if not t.walks and t not in flat[:1]], 43)
     first = samples.assessment()
     seen = [k for k, o in enumerate(first.objects) if o.ways and not o.is_dark]
     if not seen:
         return first
 
+    references = {samples.reference(k) for k in seen}
+
     def left_of(assessed: Assessment) -> float:
         return max(effort.seconds - assessed.seconds / len(seen), 0.0)
 
+    def look(assessed: Assessment) -> tuple[list[Technique], Technique | None, dict[Technique, str]]:
+        return promising([assessed.objects[k] for k in seen], ahead, later, job, effort.seconds, references)
+
     # Spend the time that is left, less what the most promising gathering takes, on walks and those that may win.
-    few, gathering, _ = promising([first.objects[k] for k in seen], ahead, later, job, effort.seconds)
-    rows = [first.objects[k].way(gathering.model) for k in seen] if gathering else []
-    reserve = sum(map(gathering_seconds, rows)) / len(seen)
+    few, gathering, _ = look(first)
+    reserve = sum(making_seconds(first.objects[k], gathering) for k in seen) / len(seen) if gathering else 0.0
     known, alone = 0.0 if every else KNOWN * job.tolerance**2, not every and not gathering and len(few) == 1
     left = max(left_of(first) - reserve, LEAST_SHARE * effort.seconds)
     _go_on(samples, first, few, left, None if alone else known, seeded(effort.seed, 71), progress)
     # Gather the light of the most promising technique, or of the next one if the scene refuses it.
     again = samples.assessment()
-    few, gathering, reasons = promising([again.objects[k] for k in seen], ahead, later, job, effort.seconds)
+    few, gathering, reasons = look(again)
     while gathering:
         run([gathering], 72)
         again = samples.assessment()
@@ -193,7 +201,7 @@ def _assessed_for(
             again = samples.assessment()
             break
         later = [t for t in later if t != gathering]
-        few, gathering, reasons = promising([again.objects[k] for k in seen], ahead, later, job, effort.seconds)
+        few, gathering, reasons = look(again)
     return _with_reasons(again, out | {t: reasons[t] for t in later if t != gathering})
 
 
@@ -219,15 +227,69 @@ def _go_on(
         rows = {technique: o.way(technique.name) for technique in few} if o.ways else {}
         for technique, row in rows.items():
             if not row.refusal and row.variance > 0:
-                others = max(len(few) - 1, 1) if technique.exact else 1
+                others = max(len(few) - 1, 1) if technique == samples.reference(k) else 1
                 parts[technique] = max(parts[technique], math.sqrt(others * samples.noise(k, technique).value))
                 enough[technique] = max(enough[technique], samples.enough(k, technique, row, known))
     whole = max(sum(parts.values()), 1e-30)
     for technique in few:
         seconds = min(left * parts[technique] / whole, enough[technique])
         if seconds > 0:
-            budget = RunBudget(seconds, own=1.0 if known is None else OWN_SHARE)
-            samples.run([technique], budget, seeded(seed, few.index(technique)), progress)
+            samples.run([technique], RunBudget(seconds), seeded(seed, few.index(technique)), progress)
+
+
+def _denoise(
+    samples: SceneSamples, chosen: Sequence[Technique], seconds: float, tolerance: float | None, every: bool
+) -> None:
+    """Measure denoised walks, if not `every` one those with less noise in the same time alone, where that can tell."""
+    asked, share = [t for t in chosen if t.denoised], DENOISED_SHARE * seconds
+    if not asked:
+        return
+    found = samples.assessment().objects
+    seen = [k for k, o in enumerate(found) if o.ways and not o.is_dark]
+    plain = {t: replace(t, denoised=False) for t in asked}
+    costs = {t: sum(_noise_cost(found[k], plain[t].name) for k in seen) for t in asked}
+    best = min(costs, key=lambda t: costs[t], default=None)
+    for technique in asked if seen else ():
+        rows = {k: _plain(found[k], plain[technique].name) for k in seen}
+        reason = next((row.refusal for row in rows.values() if row.refusal), "")
+        if not samples.on.scene.sensors()[samples.effort.sensor].film().rfilter().is_box_filter():
+            reason = "the film must have a box filter for a denoiser"
+        if not find_spec("mitsuba_oidn"):
+            reason = "no denoiser is installed (mitsuba-oidn)"
+        if tolerance is not None and not every and not reason:
+            reason = _not_denoised(plain[technique].name, plain[best].name, costs[technique], share, tolerance)
+        if reason:
+            samples.denoised[technique] = [TechniqueTrade(technique.name, refusal=reason)] * len(found)
+            continue
+        sensor, seed = samples.effort.sensor, samples.effort.seed
+        known = [(float(np.mean(o.radiance)), rows[k]) if k in rows else None for k, o in enumerate(found)]
+        budget = DenoisingBudget(share, tolerance, sensor, seed)
+        samples.denoised[technique] = denoised_rows(samples.on, technique, known, budget)
+
+
+def _not_denoised(name: str, best: str, cost: float, seconds: float, tolerance: float) -> str:
+    """Why denoised walks are not worth a look for a job; empty where they are.
+
+    In a time T the halves of n pixels that cost t a sample have V 2 n t / T of noise, which leaves their error² that
+    over sqrt(n).
+    """
+    if name != best:
+        return f"not measured, as {best} has less noise in the same time"
+    error2 = 2 * cost * math.sqrt(TILES * TILE**2) / seconds
+    if error2 > 0.5 * tolerance**2:
+        return f"not measured, as {seconds:.2g} s tell its error to {100 * math.sqrt(error2):.2g} % only"
+    return ""
+
+
+def _plain(assessed: ObjectTrade, name: str) -> TechniqueTrade:
+    rows = [row for row in assessed.ways if row.way == name]
+    return rows[0] if rows else TechniqueTrade(name, refusal=f"{name} is not among the techniques")
+
+
+def _noise_cost(assessed: ObjectTrade, name: str) -> float:
+    """Variance of a sample times its seconds."""
+    row = _plain(assessed, name)
+    return math.inf if row.refusal else row.variance * row.seconds
 
 
 def learn(on: Stage, seconds: float, seed: int = 0, progress: NamedProgress | None = None) -> None:
@@ -260,6 +322,7 @@ DEAR_SECONDS = 30.0  # of an assessment that looks at the dearest ways too
 GATHERING = 2**19  # samples of a model whose time the gathering of its light takes at least
 LONGEST = 1.5  # times the seconds of an assessment that a gathering may take
 LIGHT_SECONDS = 0.4  # of a part of the light, beside its transfer: by emitters, and of the first samples
+CORRECTED_ERROR, CORRECTED_SPREAD = 0.05, 1.6  # median and factor of it over scenes, see docs/light.md
 CLOSE = 1.3  # times the cost of the cheapest way, up to which another may turn out cheaper
 
 
@@ -289,7 +352,12 @@ def as_far_off(
 
 
 def promising(
-    seen: Sequence[ObjectTrade], ahead: Sequence[Technique], later: Sequence[Technique], job: Job, seconds: float
+    seen: Sequence[ObjectTrade],
+    ahead: Sequence[Technique],
+    later: Sequence[Technique],
+    job: Job,
+    seconds: float,
+    references: Collection[Technique] = (WALKS,),
 ) -> tuple[list[Technique], Technique | None, dict[Technique, str]]:
     """Walks and the techniques that may win against them, the one whose light is worth gathering, why others are not.
 
@@ -299,6 +367,7 @@ def promising(
         later: those whose light has to be gathered before, or that take long to run.
         job: that the cheapest is looked for.
         seconds: of the assessment.
+        references: walks that biases are measured against.
     """
     names = {name for o in seen for name in contenders(o, job.tolerance)}
     reasons = {technique: [left_out(o, technique, job, seconds) for o in seen] for technique in later}
@@ -307,18 +376,32 @@ def promising(
     if wanted:
         best = most_promising(seen, wanted, job)
         why |= dict.fromkeys(wanted, f"not measured, as {best.name} promises more: ask for it by its name")
-        names -= {technique.model for technique in wanted}  # they cannot win where their light is worth gathering
-    return [technique for technique in ahead if technique.name in names or technique.exact], best, why
+        # they cannot win where their light is worth gathering
+        names -= {technique.model for technique in wanted if technique.light == GATHERED}
+    few = [t for t in ahead if t.name in names or t.exact or t in references]
+    return few, best, why
 
 
-def gathering_seconds(row: TechniqueTrade) -> float:
-    """Seconds of gathering two parts of the light of a model."""
-    return 2 * (PART * GATHERING * row.seconds + LIGHT_SECONDS)
+def making_seconds(assessed: ObjectTrade, technique: Technique) -> float:
+    """Seconds of what an assessment makes of the light of a model: two parts of gathered light, or all, corrected."""
+    row = _plain(assessed, technique.model)
+    gathering = 0.0 if row.refusal else GATHERING * row.seconds
+    if technique.light != CORRECTED:
+        return 2 * (PART * gathering + LIGHT_SECONDS)
+    walks = min(row.seconds for row in assessed.ways if row.way.startswith(PATH_TRACED) and row.seconds > 0)
+    return gathering + 2 * LIGHT_SECONDS + FEWEST_WALKS * walks
 
 
 def left_out(assessed: ObjectTrade, technique: Technique, job: Job, seconds: float) -> str:
     """Why a technique is not worth a run for an object, by what others have shown; empty where it is."""
     best, known = cheapest(assessed, job), {row.way: row for row in assessed.ways}
+    if technique.light == CORRECTED:
+        least, chance = making_seconds(assessed, technique), corrected_chance(job.tolerance)
+        # time is spent on it by its chance, all that others have at one half
+        if least < min(chance * (best - least), 2 * chance * LONGEST * seconds):
+            return ""
+        why = f"not measured, as it takes {least:.2g} s or longer, and {100 * chance:.2g} % of such light is so right"
+        return f"{why}: ask for it by its name"
     if technique.model not in known:
         return f"not measured in less than {DEAR_SECONDS:g} s: ask for it by its name"
     row = known[technique.model]
@@ -346,12 +429,21 @@ def most_promising(seen: Sequence[ObjectTrade], wanted: Sequence[Technique], job
     def expected(technique: Technique) -> float:
         total = 0.0
         for o in seen:
+            if technique.light == CORRECTED:
+                chance = corrected_chance(job.tolerance)
+                total += chance * making_seconds(o, technique) + (1 - chance) * cheapest(o, job)
+                continue
             row = o.way(technique.model)
             chance = NormalDist().cdf((job.tolerance**2 - max(row.bias2, 0.0)) / max(row.bias2_error, 1e-30))
             total += chance * (row.once + GATHERING * row.seconds) + (1 - chance) * cheapest(o, job)
         return total
 
     return min(wanted, key=expected)
+
+
+def corrected_chance(tolerance: float) -> float:
+    """The chance that corrected light of the fewest walks keeps a tolerance, by what was measured of others."""
+    return NormalDist().cdf(math.log(tolerance / CORRECTED_ERROR) / math.log(CORRECTED_SPREAD))
 
 
 def cheapest(assessed: ObjectTrade, job: Job) -> float:
@@ -371,4 +463,4 @@ def contenders(assessed: ObjectTrade, tolerance: float) -> list[str]:
 def _at_best(row: TechniqueTrade, tolerance: float) -> float:
     """Seconds for a pixel if the bias is as small as it may be."""
     left = tolerance**2 - max(row.bias2 - DOUBT * row.bias2_error, 0.0)
-    return max(row.variance / left, 1.0) * row.seconds if left > 0 else math.inf
+    return max(row.variance / left, row.least) * row.seconds if left > 0 else math.inf

@@ -34,12 +34,13 @@ from full_geometry.trade.statistics import (
     mean_square,
     mean_square_of,
     mean_square_of_parts,
+    mean_square_to_parts,
     noise_of_parts,
     ratio_of_means,
     relative_variance,
     with_prior,
 )
-from full_geometry.trade.techniques import PRECOMPUTED, RAYS, WALKS, Effort, Stage, Technique
+from full_geometry.trade.techniques import PRECOMPUTED, PRECOMPUTED_WALKS, RAYS, WALKS, Effort, Stage, Technique
 from halfspace_sss.backend import clock
 from halfspace_sss.progress import NamedProgress
 
@@ -48,13 +49,13 @@ WALKED = 0.5  # of the time of walks, where delta lights are blurred: the rest t
 # by 0.06 +- 0.06 of itself, on a bunny of 2 to 5 mean free paths, where it is 12 % of all.
 BLUR_EFFECT = 0.1
 BLUR_SEEN = 0.04  # probability that a direction is in the cone of `sample_blur`
-OWN_SHARE = 0.15  # of the time of a technique, for its cost in the light of the scene; the smoothed light has the rest
-SMOOTHING_PAYS = 2.0  # times the variance by the smoothed environment that walks have by the own one, so that it pays
-SMOOTHING_EFFECT = 0.2  # of a bias², what smoothing may change of it: see benchmarks/notes/trade_check.md
 FEWEST, POINTS = 64, 5e-3  # of points, and how many times V t
 # Of precomputed light before any measurement: means of images are right to .3 %, points to about 1 %. On a ball of skin
 # under lamp and sky, 1e7 samples gave 4.8e-5 +- 5.4e-5.
 KNOWN_BIAS2 = 1e-4
+TELLING = (
+    0.02  # squared noise of walks at a point, above which their rare bright samples decide what they tell of a bias
+)
 RUN, SLOW = 16_000, 4  # samples of all points in the first run of a technique, for slow walks a quarter
 UNEVEN = 1.5  # times the noise of a bias² if all points were as noisy
 STEADY = 0.05  # relative error of their variance where nothing may win against walks
@@ -69,13 +70,11 @@ class RunBudget(NamedTuple):
         seconds: for each object; with 0 the first samples are all.
         samples: of each exit, instead.
         traced: share of the walks.
-        own: share of the light of the scene, where biases are measured by a smoothed environment.
     """
 
     seconds: float = 0.0
     samples: int | None = None
     traced: float = 1.0
-    own: float = OWN_SHARE
 
 
 @dataclass(eq=False)
@@ -90,6 +89,7 @@ class SceneSamples:
         sampled: of each object by each technique.
         heard: warnings.
         mfp: mean free paths across, smallest and largest of the channels.
+        denoised: of each object by denoised walks.
     """
 
     on: Stage
@@ -99,6 +99,7 @@ class SceneSamples:
     sampled: list[Samples]
     heard: list[list[str]]
     mfp: list[tuple[float, float]]
+    denoised: dict[Technique, list[TechniqueTrade | None]] = field(default_factory=dict)
     _training: dict[tuple[int, str], float] = field(default_factory=dict)
 
     @classmethod
@@ -142,7 +143,7 @@ class SceneSamples:
             share = budget.traced if technique.exact and len(chosen) > 1 else 1 / (len(chosen) - done)
             if technique.gathers and len(chosen) > 1 and not samples:
                 share = min(share, GATHERED_SHARE)
-            for half, part in enumerate(on.runs(technique)):
+            for half, part in enumerate(technique.halves):
                 started = clock()
                 try:
                     number = seeded(seed, chosen.index(technique), *([half] if half else []))
@@ -151,8 +152,8 @@ class SceneSamples:
                     # Make it ready and take few samples; compilation is not counted in its time.
                     result, beside = _begun(on, part, points, (number, each), k, sampled[technique], half)
                     end, started = end + beside, started + beside
-                    left = share * _part_of(on, technique, part, budget) * (end - started) - (clock() - started)
-                    blurs = technique.exact and on.blurs and not part.smoothed
+                    left = share / len(technique.halves) * (end - started) - (clock() - started)
+                    blurs = technique.exact and on.blurs
                     left *= WALKED if blurs else 1.0
                     # Go on for its share of what is left.
                     sample_more(on, part, points, result, number, seconds=left, samples=samples)
@@ -173,32 +174,24 @@ class SceneSamples:
         which are equal for n = time b² / (V t).
         """
         for k, o in enumerate(walked.objects):
-            noise = self.noise(k, WALKS).value if o.ways else 0.0
+            noise = self.noise(k, self.reference(k)).value if o.ways else 0.0
             if noise > 0:
                 n = min(max(int(POINTS / noise), FEWEST), self.points[k].n)
                 self.points[k] = self.points[k].first(n)
-                for each in (each for item in self.sampled[k].values() for each in item):
+                for each in (each for of in self.sampled[k].values() if not isinstance(of, str) for each in of):
                     each.estimate = each.estimate.of_first(n)
 
     def noise(self, k: int, technique: Technique) -> Number:
         """V t of the samples that tell the bias of a technique, and the seconds that they took."""
-        walks, of_bias = (_of_bias(self.on, each, self.sampled[k][each]) for each in (WALKS, technique))
-        a, b = (joined([each.estimate for each in of]) for of in (of_bias, walks))
-        seconds = of_bias[-1].seconds
+        found = self.sampled[k][technique]
+        a, seconds = joined([each.estimate for each in found]), found[-1].seconds
+        b = joined([each.estimate for each in self.sampled[k][self.reference(k)]])
         return Number(relative_variance(a, b).value * seconds, a.samples * a.mean.shape[1] * seconds)
 
-    def smoothing_pays(self) -> bool:
-        """Whether walks have much less noise by the smoothed environment than by that of the scene."""
-        walks = (of.get(WALKS) for of in self.sampled)
-        V = ([relative_variance(each.estimate, each.estimate).value for each in found] for found in walks if found)
-        return any(own > SMOOTHING_PAYS * smoothed for own, smoothed in V)
-
-    def drop_smoothing(self) -> None:
-        """Tell biases by the light of the scene, and forget the samples by the smoothed environment."""
-        for of in self.sampled:
-            of |= {each: _of_cost(self.on, each, found) for each, found in of.items() if not isinstance(found, str)}
-        self.on.lit(WALKS)
-        self.on = replace(self.on, smoothed=None)
+    def reference(self, k: int) -> Technique:
+        """The walks that biases of an object are measured against: with precomputed light where that is possible."""
+        found = self.sampled[k].get(PRECOMPUTED_WALKS)
+        return PRECOMPUTED_WALKS if isinstance(found, list) and found else WALKS
 
     def enough(self, k: int, technique: Technique, row: TechniqueTrade, known: float | None) -> float:
         """Further seconds until a small bias² has the standard error `known`; with None until its variance is known."""
@@ -214,12 +207,13 @@ class SceneSamples:
             if points is None:
                 objects.append(_unseen(self.on.names[k], self.mfp[k]))
                 continue
-            walks, rows = sampled[WALKS], []
+            rows, reference = [], sampled[self.reference(k)]
             for technique, item in sampled.items():
-                row = _row(self.on, k, technique, item, walks)
+                row = _row(self.on, k, technique, item, sampled[WALKS], reference)
                 rows.append(row if row.refusal else replace(row, training=self.training(k, technique)))
             compiled += sum(row.compilation for row in rows)
-            radiance = tuple(float(v) for v in walks[0].estimate.mean.mean(axis=1))
+            rows += [found[k] for found in self.denoised.values() if found[k] is not None]
+            radiance = tuple(float(v) for v in joined([r.estimate for r in reference]).mean.mean(axis=1))
             objects.append(ObjectTrade(
                 object=self.on.names[k], mfp=self.mfp[k], share=points.share, pixels=points.pixels, radiance=radiance,
                 ways=tuple(rows), notes=tuple(dict.fromkeys(self.heard[k])),
@@ -251,14 +245,6 @@ def _mfp(on: Stage, k: int) -> tuple[float, float]:
     return min(thickness), max(thickness)
 
 
-def _part_of(on: Stage, technique: Technique, run: Technique, budget: RunBudget) -> float:
-    """The share of a run in the time of its technique; few samples tell what gathered light costs."""
-    own = 0.0 if technique.gathers else budget.own
-    if on.smoothed is None:
-        return 1 / len(technique.halves)
-    return (1 - own) / len(technique.halves) if run.smoothed else own
-
-
 def _begun(
     on: Stage, run: Technique, points: Exits, how: tuple[int, int], k: int, sampled: list[Sampled], half: int
 ) -> tuple[Sampled, float]:
@@ -272,37 +258,32 @@ def _begun(
     return result, result.compiling + (0.0 if half or not run.gathers else result.preparing)
 
 
-def _of_cost(on: Stage, technique: Technique, sampled: list[Sampled]) -> list[Sampled]:
-    """The runs of a technique in the light of the scene, which tell its cost."""
-    return [each for run, each in zip(on.runs(technique), sampled) if not run.smoothed]
-
-
-def _of_bias(on: Stage, technique: Technique, sampled: list[Sampled]) -> list[Sampled]:
-    """The runs of a technique that tell its bias: those by the smoothed environment if there is one."""
-    return [each for run, each in zip(on.runs(technique), sampled) if run.smoothed == (on.smoothed is not None)]
-
-
-def _row(on: Stage, k: int, technique: Technique, sampled: list[Sampled] | str, walks: list[Sampled]) -> TechniqueTrade:
+def _row(
+    on: Stage, k: int, technique: Technique, sampled: list[Sampled] | str, walks: list[Sampled],
+    reference: list[Sampled],
+) -> TechniqueTrade:  # fmt: skip
     if isinstance(sampled, str):
         return TechniqueTrade(technique.name, refusal=sampled)
-    cost, bias = (joined([each.estimate for each in of(on, technique, sampled)]) for of in (_of_cost, _of_bias))
-    (walked,), (b,) = _of_cost(on, WALKS, walks), [each.estimate for each in _of_bias(on, WALKS, walks)]
-    parts = [each.estimate for each in _of_bias(on, technique, sampled)]
-    last = _of_cost(on, technique, sampled)[-1]  # with kernels ready
+    parts, known, last = [each.estimate for each in sampled], [each.estimate for each in reference], sampled[-1]
+    (walked,), cost, b = walks, joined(parts), joined(known)
     # Estimate bias² against walks; of gathered light by two parts, whose noise more samples do not take away.
     bias2, doubt = Number(0.0, 0.0), Number(0.0, 0.0)
     if not technique.exact:
         several = len(parts) > 1
-        bias2 = mean_square_of_parts(parts, b, _kept(on, k, technique)) if several else mean_square(bias, b)
-    if technique.light == PRECOMPUTED:
-        bias2 = with_prior(bias2, KNOWN_BIAS2)
+        kept = _kept(on, k, technique) if several else 0.0
+        bias2 = mean_square_of_parts(parts, walked.estimate, kept) if several else mean_square(cost, walked.estimate)
+        if technique.light == PRECOMPUTED:
+            bias2 = _of_precomputed(walked, known)
+        elif len(known) > 1:
+            own, precisely = _of_precomputed(walked, known), mean_square_to_parts(parts, known, kept)
+            precisely = Number(precisely.value, math.hypot(precisely.error, max(own.value, 0.0) + own.error))
+            bias2 = min(bias2, precisely, key=lambda each: each.error)
     if walked.blur:
         doubt = _of_blur(walked.blur, walked.estimate)
-    # Add what the blur of delta lights and the smoothing of the environment may be off by to its standard error.
-    effect = SMOOTHING_EFFECT * max(bias2.value, 0.0) if on.smoothed else 0.0
-    bias2 = Number(bias2.value + max(doubt.value, 0.0), math.hypot(bias2.error, doubt.error, effect))
-    ratios = [(1.0, 0.0) if technique.exact else ratio_of_means(bias, b, c) for c in range(len(b.mean))]
-    variance = relative_variance(cost, walked.estimate)
+    # Add what the blur of delta lights may be off by to its standard error.
+    bias2 = Number(bias2.value + max(doubt.value, 0.0), math.hypot(bias2.error, doubt.error))
+    ratios = [(1.0, 0.0) if technique.exact else ratio_of_means(cost, b, c) for c in range(len(b.mean))]
+    variance = relative_variance(cost, b)
     if technique.light == PRECOMPUTED:
         # Rays of light are as many as samples: their noise falls with that of walks.
         noise, samples = noise_of_parts(parts, b), _samples_of_pixel(on)
@@ -313,6 +294,13 @@ def _row(on: Stage, k: int, technique: Technique, sampled: list[Sampled] | str, 
         seconds=last.seconds, samples=cost.samples * cost.mean.shape[1], preparation=last.preparation,
         compilation=sum(each.compilation for each in sampled), memory=last.memory,
     )  # fmt: skip
+
+
+def _of_precomputed(walked: Sampled, parts: list[RadianceEstimate]) -> Number:
+    """The bias² of walks with precomputed light, as far as walks by chance can tell."""
+    noise = relative_variance(walked.estimate, joined(parts)).value / max(walked.estimate.samples, 1)
+    found = mean_square_of_parts(parts, walked.estimate, 0.0)
+    return with_prior(found, KNOWN_BIAS2) if noise < TELLING else Number(0.0, KNOWN_BIAS2)
 
 
 def _samples_of_pixel(on: Stage) -> float:

@@ -25,8 +25,8 @@ class TechniqueTrade:
     Attributes:
         way: its name.
         bias2: squared relative error of radiance that no number of samples removes, noise taken out; it may come out
-            below 0. Mean over visible exits and channels, over the square of the mean radiance. With a smoothed
-            environment map, where a tolerance is asked, as `ratio` is: see `SmoothedEnvironment`.
+            below 0. Mean over visible exits and channels, over the square of the mean radiance. For denoised walks
+            it is the whole squared error of an image of `least` samples of a pixel.
         bias2_error: its standard error.
         ratio, ratio_error: mean radiance over that of walks, for each channel, with standard errors.
         variance, variance_error: of one sample without fireflies (`statistics.FIREFLIES`), over the square of the mean
@@ -36,6 +36,7 @@ class TechniqueTrade:
         preparation, compilation: seconds, once for a scene; kernels that were compiled before are found again.
         training: seconds, once for an object; 0 for what needs none.
         memory: most bytes that Dr.Jit held in a launch.
+        least: samples of a pixel that are needed, however large the tolerance is.
         flip, flip_noise: mean FLIP of a small image against that of walks, and of two images of walks; None if the
             evaluator is not installed.
         refusal: why it could not be assessed; all numbers are nan then.
@@ -54,6 +55,7 @@ class TechniqueTrade:
     compilation: float = 0.0
     training: float = 0.0
     memory: int = 0
+    least: int = 1
     flip: float | None = None
     flip_noise: float | None = None
     refusal: str = ""
@@ -101,13 +103,14 @@ class TechniqueTrade:
 def samples_for(row: TechniqueTrade, tolerance: float) -> float:
     """Samples n of a pixel that bring bias² + variance / n and z of its standard errors to tolerance²; inf for none.
 
-    With a = tolerance² - bias² and z = DOUBT the smaller root of (a - V / n)² = z² (s² + (v / n)²).
+    With a = tolerance² - bias² and z = DOUBT the smaller root of (a - V / n)² = z² (s² + (v / n)²); at least `least`.
     """
     a, s, v = tolerance**2 - max(row.bias2, 0.0), DOUBT * row.bias2_error, DOUBT * row.variance_error
     if not a > s:
         return math.inf
     V = row.variance
-    return (a * V + math.sqrt(max(a**2 * V**2 - (V**2 - v**2) * (a**2 - s**2), 0.0))) / (a**2 - s**2)
+    n = (a * V + math.sqrt(max(a**2 * V**2 - (V**2 - v**2) * (a**2 - s**2), 0.0))) / (a**2 - s**2)
+    return max(n, row.least)
 
 
 @dataclass(frozen=True)
@@ -163,6 +166,16 @@ class Assessment:
     compilation: float
     seed: int
 
+    @classmethod
+    def from_record(cls, record: dict[str, Any]) -> Assessment:
+        """The assessment of a `record`."""
+        objects = []
+        for o in record["objects"]:
+            rows = tuple(TechniqueTrade(**{key: _known(key, value) for key, value in w.items()}) for w in o["ways"])
+            lists = {key: tuple(o[key]) for key in ("mfp", "radiance", "notes")}
+            objects.append(ObjectTrade(**{**o, **lists, "ways": rows}))
+        return cls(tuple(objects), record["seconds"], record["compilation"], record["seed"])
+
     def table(self) -> pandas.DataFrame:
         """One row for each object and way."""
         import pandas
@@ -185,6 +198,13 @@ class Assessment:
     def record(self) -> dict[str, Any]:
         """Ready for JSON; what is not known is None there."""
         return plain(asdict(self))
+
+
+def _known(key: str, value: object) -> object:
+    """A field of a `TechniqueTrade` from JSON."""
+    if key in ("ratio", "ratio_error"):
+        return tuple(math.nan if v is None else v for v in value)
+    return math.nan if value is None and key not in ("flip", "flip_noise") else value
 
 
 def plain(value: object) -> object:

@@ -80,9 +80,7 @@ def first_sample(
     if (object, technique) in stage.paces:
         estimate = RadianceEstimate(variant_channels(), exits.n)
         return replace(stage.paces[object, technique], estimate=estimate, preparing=0.0, compilation=0.0, compiling=0.0)
-    started = clock()
-    _prepare(stage, technique)
-    preparation = preparing = clock() - started
+    preparation = preparing = _prepared_in(stage, technique)
     if technique.gathers and technique.part:  # of all samples, after what parts and whole have in common
         made, light = stage.integrator(technique).gathering.seconds
         preparation = max(preparing - made - light, 0.0) + made / PART + 2 * light
@@ -90,10 +88,31 @@ def first_sample(
         preparation += same.preparation if same else 0.0
     result = Sampled(RadianceEstimate(variant_channels(), exits.n), preparation, preparing)
     if technique.light == CORRECTED:  # larger images have more walks
-        result.beside = stage.integrator(technique).corrections.seconds / (FEWEST_WALKS * SAMPLES_PER_WALK)
+        result.beside = _beside(stage, exits, stage.integrator(technique).corrections.seconds)
     _first_launch(stage, technique, exits, result, each, seeded(seed, 31))
     stage.paces[object, technique] = result
     return result
+
+
+def _prepared_in(stage: Stage, technique: Technique) -> float:
+    """Seconds in which a way was made ready; of what is made as a whole once more where kernels were compiled."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        started = clock()
+        _prepare(stage, technique)
+        seconds = clock() - started
+        known = all(kernel["cache_hit"] for kernel in dr.kernel_history([dr.KernelType.JIT]))
+    if known or technique.light != CORRECTED:
+        return seconds
+    stage.forget(technique)
+    started = clock()
+    _prepare(stage, technique)
+    return clock() - started
+
+
+def _beside(stage: Stage, exits: Exits, seconds: float) -> float:
+    """Seconds of walks that a sample of the object brings along, beyond those that every image has."""
+    return seconds / (FEWEST_WALKS * SAMPLES_PER_WALK) / max(exits.share, 1e-9)
 
 
 def _first_launch(stage: Stage, technique: Technique, exits: Exits, sampled: Sampled, each: int, seed: int) -> None:
@@ -126,7 +145,7 @@ def warm_up(stage: Stage, techniques: Sequence[Technique]) -> None:
 
 
 def _prepare(stage: Stage, technique: Technique) -> None:
-    integrator, scene = stage.integrator(technique), stage.lit(technique)
+    integrator, scene = stage.integrator(technique), stage.scene
     if technique.light == PRECOMPUTED:
         integrator.prepare(scene, RAYS * SAMPLES_PER_RAY, technique.part)
     else:
@@ -187,7 +206,7 @@ def sample_blur(stage: Stage, exits: Exits, seed: int, samples: int) -> Radiance
     while (each := min(samples - estimate.samples, most)) > 0:
         number, rays = seeded(seed, 33, estimate.samples), exits.rays(each)
         without, spread = (
-            radiance(stage.lit(w), stage.integrator(w), independent(number, dr.width(rays)), rays) for w in techniques
+            radiance(stage.scene, stage.integrator(w), independent(number, dr.width(rays)), rays) for w in techniques
         )
         estimate.add(*_sums([b - a for a, b in zip(without, spread)], each), each)
     return estimate
@@ -213,7 +232,7 @@ def _launch(
     dr.flush_malloc_cache()
     dr.detail.malloc_clear_statistics()
     started = clock()
-    L = _recorded(stage.lit(technique), stage.integrator(technique), independent(seed, dr.width(rays)), rays)
+    L = _recorded(stage.scene, stage.integrator(technique), independent(seed, dr.width(rays)), rays)
     recorded = clock()
     dr.eval(L)
     first, second = _sums(L, each)

@@ -159,6 +159,25 @@ def mean_square_of_parts(parts: tuple[RadianceEstimate, RadianceEstimate], b: Ra
     return _with_shared(_ratio((left + kept * noise).mean(axis=0), walks.mean.mean(axis=0), 2), walks)
 
 
+def mean_square_to_parts(
+    parts: Sequence[RadianceEstimate], walks: Sequence[RadianceEstimate], kept: float
+) -> Number:  # fmt: skip
+    """Mean squared difference from two independent parts b of walks, whose noise no product has:
+
+        bias² = Σ_k,c [(a_1 - b_1)(a_2 - b_2) + (a_1 - b_2)(a_2 - b_1) + kept (a_1 - a_2)²] / (2 n C)
+
+    with var a_1 + var a_2 taken off the last square, or Σ_k,c [(a - b_1)(a - b_2) - var a] / (n C) of a single a, over
+    the square of the mean radiance of b.
+    """
+    (one, two), (b, c) = (parts[0].steady, parts[-1].steady), (each.steady for each in walks)
+    square = 0.5 * ((one.mean - b.mean) * (two.mean - c.mean) + (one.mean - c.mean) * (two.mean - b.mean))
+    if len(parts) == 1:
+        square -= one.noise
+    square += 0.5 * kept * ((one.mean - two.mean) ** 2 - one.noise - two.noise) if len(parts) > 1 else 0.0
+    mean = 0.5 * (b.mean + c.mean).mean(axis=0)
+    return _with_shared(_ratio(square.mean(axis=0), mean, 2), one, b, c)
+
+
 def noise_of_parts(parts: tuple[RadianceEstimate, RadianceEstimate], b: RadianceEstimate) -> Number:
     """Variance of what two parts are made of beside their samples, over the square of the mean radiance of b."""
     one, two = (part.steady for part in parts)
@@ -204,3 +223,10 @@ def _ratio(top: np.ndarray, bottom: np.ndarray, power: int) -> Number:
     tops, bottoms = (top.sum() - top) / (n - 1), (bottom.sum() - bottom) / (n - 1)
     parts = tops / np.maximum(bottoms, 1e-300) ** power
     return Number(float(whole), float(np.sqrt((n - 1) * np.mean((parts - parts.mean()) ** 2))))
+
+
+def ratio(top: np.ndarray, bottom: np.ndarray) -> Number:
+    """Σ top / Σ bottom, with its standard error by the jackknife over what is summed."""
+    rest = (top.sum() - top) / np.maximum(bottom.sum() - bottom, 1e-300)
+    n = len(top)
+    return Number(float(top.sum() / bottom.sum()), float(np.sqrt((n - 1) / n * np.sum((rest - rest.mean()) ** 2))))

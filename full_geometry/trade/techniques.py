@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
-import numpy as np
 
 from full_geometry.integrators.bssrdf import is_bssrdf
-from full_geometry.integrators.correction import Corrections
 from full_geometry.integrators.gathering import Gathering
 from full_geometry.objects.objects import KnowsUnit, millimetres, refuse_instances, translucent_shapes
 from full_geometry.objects.small_emitters import is_delta
@@ -23,8 +18,12 @@ from full_geometry.settings import AUTO, GATHERED_LIGHTS, check_variant
 from full_geometry.transport.models import model_names
 from halfspace_sss.checks import check_choice, check_count, check_interval
 
-LAMBERT, READY_FIRST = "lambert", "better_dipole"
+LAMBERT = "lambert"
+# By one model alone: the walks take away what is wrong with it. It has the narrowest tables, gathers first, and takes
+# textures and clear objects.
+READY_FIRST = "better_dipole"
 GATHERED, CORRECTED, PRECOMPUTED = *GATHERED_LIGHTS, "precomputed"
+DENOISED = ", denoised"
 RAYS = 2**19  # of light precomputed for walks, for each object: its noise at a point is 3 to 8 %
 
 
@@ -38,14 +37,14 @@ class Technique:
             `unscattered_light`.
         part: of gathered light, see `Gathering`, 0 for all of it; of precomputed light one independent of other parts.
         blur: of walks, see `translucent_walk`.
-        smoothed: whether by the smoothed environment, see `SmoothedEnvironment`.
+        denoised: whether the image of walks is denoised.
     """
 
     model: str
     light: str = "sampled"
     part: int = 0
     blur: float = 1.0
-    smoothed: bool = False
+    denoised: bool = False
 
     @property
     def walks(self) -> bool:
@@ -54,7 +53,7 @@ class Technique:
     @property
     def exact(self) -> bool:
         """Whether it is walks with sampled light, the reference of biases."""
-        return self.walks and self.light == "sampled"
+        return self.walks and self.light == "sampled" and not self.denoised
 
     @property
     def gathers(self) -> bool:
@@ -63,38 +62,45 @@ class Technique:
 
     @property
     def halves(self) -> tuple[Technique, ...]:
-        """The techniques that it is measured by: itself, or two independent parts of gathered or precomputed light."""
-        return (self,) if self.light == "sampled" else (replace(self, part=1), replace(self, part=2))
+        """The techniques that it is measured by: itself, or two independent parts of gathered or precomputed light.
+
+        Corrected light is measured as images have it, so that the noise of its walks counts.
+        """
+        return (self,) if self.light in ("sampled", CORRECTED) else (replace(self, part=1), replace(self, part=2))
 
     @property
     def name(self) -> str:
-        return self.model if self.light == "sampled" else f"{self.model}, {self.light}"
+        light = "" if self.light == "sampled" else f", {self.light}"
+        return self.model + light + (DENOISED if self.denoised else "")
 
     @property
     def flags(self) -> str:
         """The options of the command `render` for it."""
-        return f"--model {self.model}" + (f" --light {self.light}" if self.walks or self.light != "sampled" else "")
+        light = f" --light {self.light}" if self.walks or self.light != "sampled" else ""
+        return f"--model {self.model}{light}" + (" --denoise" if self.denoised else "")
 
     @classmethod
     def of(cls, name: str) -> Technique:
         """The technique of that name; ValueError if there is none."""
-        model, _, light = name.partition(", ")
+        denoised = name.startswith(PATH_TRACED) and name.endswith(DENOISED)
+        model, _, light = (name.removesuffix(DENOISED) if denoised else name).partition(", ")
         check_choice("way", model, (PATH_TRACED, *(m for m in model_names() if m != AUTO)))
         known = {PATH_TRACED: (PRECOMPUTED,), LAMBERT: ()}.get(model, GATHERED_LIGHTS)
         if light:
             check_choice(f"light of {model}", light, known)
-        return cls(model, light or "sampled")
+        return cls(model, light or "sampled", denoised=denoised)
 
 
 WALKS = Technique(PATH_TRACED)
 PRECOMPUTED_WALKS = Technique(PATH_TRACED, light=PRECOMPUTED)
+DENOISED_WALKS = tuple(replace(each, denoised=True) for each in (WALKS, PRECOMPUTED_WALKS))
 
 
 def techniques() -> list[Technique]:
-    """All of them: path traced first, with light sampled and precomputed, a diffuse surface, every model with light
-    sampled and gathered, and the one that is ready first with light corrected."""
+    """All of them: path traced first, with light sampled and precomputed, denoised too, a diffuse surface, every model
+    with light sampled and gathered, and the one that is ready first with light corrected."""
     names = [name for name in model_names() if name not in (AUTO, LAMBERT)]
-    results = [WALKS, PRECOMPUTED_WALKS, Technique(LAMBERT), *map(Technique, names)]
+    results = [WALKS, PRECOMPUTED_WALKS, *DENOISED_WALKS, Technique(LAMBERT), *map(Technique, names)]
     return [*results, *(Technique(name, light=GATHERED) for name in names), Technique(READY_FIRST, light=CORRECTED)]
 
 
@@ -108,7 +114,6 @@ class Stage:
         settings: of its integrator, by parameter name.
         bssrdf: parameters that `bssrdf` alone understands.
         paces: first `Sampled` of earlier runs by (object, technique), so that the next run knows what a sample takes.
-        smoothed: environment that biases are measured by; None where the light of the scene does it.
     """
 
     scene: mi.Scene
@@ -116,7 +121,6 @@ class Stage:
     settings: dict[str, Any]
     bssrdf: dict[str, Any]
     paces: dict[tuple[int, Technique], Any] = field(default_factory=dict)
-    smoothed: SmoothedEnvironment | None = None
     _integrators: dict[Technique, mi.Integrator] = field(default_factory=dict)
 
     @property
@@ -133,42 +137,19 @@ class Stage:
         """Whether walks spread light of a delta light over a blur, so that they are not exact."""
         return any(map(is_delta, self.scene.emitters()))
 
-    @contextmanager
-    def with_smoothed_environment(self) -> Iterator[Stage]:
-        """The stage with its environment map smoothed too, if it has one; its own is put back at the end."""
-        smoothed = SmoothedEnvironment.of(self.scene)
-        try:
-            yield replace(self, smoothed=smoothed)
-        finally:
-            if smoothed is not None:
-                smoothed.show(False)
-
-    def runs(self, technique: Technique) -> tuple[Technique, ...]:
-        """The runs of a technique: its halves; smoothed for the bias, with one half unsmoothed for the cost."""
-        if self.smoothed is None:
-            return technique.halves
-        *rest, last = (replace(half, smoothed=True) for half in technique.halves)
-        return (*rest, technique.halves[-1], last)
-
-    def lit(self, technique: Technique) -> mi.Scene:
-        """The scene in the light of a run."""
-        if self.smoothed is not None:
-            self.smoothed.show(technique.smoothed)
-        return self.scene
-
     def integrator(self, technique: Technique) -> mi.Integrator:
-        """The integrator of a technique, which keeps what it has made ready; shapes are the same in all light."""
-        technique = replace(technique, smoothed=technique.smoothed and technique.light == PRECOMPUTED)
+        """The integrator of a technique, which keeps what it has made ready; denoised walks are walks."""
+        technique = replace(technique, denoised=False)
         if technique not in self._integrators:
             if technique.walks:
                 plugin = {"type": "translucent_walk", **self.settings, "blur": technique.blur, "light": technique.light}
+                plugin["layers"] = True  # a denoiser leaves what they show
             else:
                 plugin = {"type": "bssrdf", **self.settings, **self.bssrdf}
                 plugin |= {"model": technique.model, "light": technique.light}
             self._integrators[technique] = mi.load_dict(plugin)
             if technique.part and not technique.walks:
                 self._integrators[technique].gathering = Gathering(technique.part)
-                self._integrators[technique].corrections = Corrections(technique.part)
             sampled = self._integrators.get(replace(technique, light="sampled", part=0))
             # spectral variants refuse gathered light
             if technique.light == GATHERED and sampled is not None and not mi.is_spectral:
@@ -264,92 +245,3 @@ class Effort:
         check_count("seed", self.seed, 0)
         check_count("exits", self.exits, 32)
         check_count("sensor", self.sensor, 0)
-
-
-# --------------------------------------------------------------------------------------------------
-# An environment map smoothed over directions, by which few walks tell how wrong a model is.
-#
-# A walk through a refracting boundary meets a window by chance alone. What S makes of light after two orders and more
-# varies little over direction, so that a smoothed map leaves its relative error nearly the same
-# (benchmarks/notes/trade_check.md):
-#
-#     L'(w) = c + g [∫ K(w.w') L(w') dw' - c],  K(x) = κ exp(κ (x - 1)) / (2 pi (1 - exp(-2 κ))),  κ = 1 / WIDTH²,
-#
-# with c the mean of L over the sphere, which L' keeps. g = 1 / (coth κ - 1/κ) keeps its first moment too; it is less
-# where L' would be below 0.
-
-
-WIDTH = 0.4  # radians
-ROWS = 17  # of the map of L', from pole to pole
-LOOKED_AT = 64  # rows of L at most: blocks of more pixels are taken together
-
-
-@dataclass(eq=False)
-class SmoothedEnvironment:
-    """The environment map of a scene, which shows its own or its smoothed pixels.
-
-    Args:
-        parameters: of the emitter.
-        own, blurred: pixels of both.
-    """
-
-    parameters: mi.SceneParameters
-    own: mi.TensorXf
-    blurred: mi.TensorXf
-    _is_smoothed: bool = False
-
-    @classmethod
-    def of(cls, scene: mi.Scene) -> SmoothedEnvironment | None:
-        """The map of a scene; None if there is none, or one of so few pixels that it is smooth."""
-        sky = scene.environment()
-        if sky is None or sky.class_name() != "EnvironmentMapEmitter" or mi.is_spectral:
-            return None
-        parameters = mi.traverse(sky)
-        own = mi.TensorXf(parameters["data"])  # a copy, as the emitter changes what it gives
-        return cls(parameters, own, mi.TensorXf(smoothed(np.array(own)))) if len(own) > ROWS else None
-
-    def show(self, smoothed: bool) -> None:
-        """Let the scene have its own or the smoothed map."""
-        if smoothed != self._is_smoothed:
-            self.parameters["data"], self._is_smoothed = self.blurred if smoothed else self.own, smoothed
-            self.parameters.update()
-
-
-def smoothed(pixels: np.ndarray) -> np.ndarray:
-    """L' of an environment map, (rows, columns, channels) with the first and last column twice as `envmap` has them.
-
-    It has as many pixels, as kernels know how many there are.
-    """
-    L = pixels[:, 1:-1]
-    theta, phi = _angles(*L.shape[:2])
-    step = math.ceil(len(theta) / LOOKED_AT)
-    rows, columns = (np.arange(0, len(angle), step) for angle in (theta, phi))
-    flux = np.add.reduceat(L * np.sin(theta)[:, None, None], rows, axis=0)
-    flux = np.add.reduceat(flux, columns, axis=1).reshape(-1, L.shape[2])
-    flux *= 2 * math.pi**2 / (len(theta) - 1) / len(phi)
-    means = (np.add.reduceat(angle, at) / np.diff([*at, len(angle)]) for angle, at in ((theta, rows), (phi, columns)))
-    kappa, few = 1 / WIDTH**2, _angles(ROWS, 2 * ROWS - 2)
-    K = np.exp(kappa * (_directions(*few) @ _directions(*means).T - 1))
-    c, blurred = flux.sum(axis=0) / (4 * math.pi), K @ flux * kappa / (2 * math.pi * -math.expm1(-2 * kappa))
-    g = min(1 / (1 / math.tanh(kappa) - 1 / kappa), float((c / np.maximum(c - blurred, 1e-30)).min()))
-    soft = (c + g * (blurred - c)).reshape(ROWS, -1, L.shape[2])
-    by_row, by_column = _weights(theta, few[0]), _weights(phi, few[1], 2 * math.pi)
-    soft = np.stack([by_row @ soft[..., k] @ by_column.T for k in range(L.shape[2])], axis=-1)
-    return np.concatenate([soft[:, -1:], soft, soft[:, :1]], axis=1).astype(np.float32)
-
-
-def _weights(fine: np.ndarray, coarse: np.ndarray, period: float | None = None) -> np.ndarray:
-    """The matrix that interpolates values at coarse angles to fine ones."""
-    return np.stack([np.interp(fine, coarse, row, period=period) for row in np.eye(len(coarse))], axis=1)
-
-
-def _angles(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
-    """Polar angles and azimuths of the pixels of a map, from pole to pole."""
-    return np.linspace(0, np.pi, rows), (np.arange(columns) + 0.5) * 2 * np.pi / columns
-
-
-def _directions(theta: np.ndarray, phi: np.ndarray) -> np.ndarray:
-    """Directions of pixels at these angles, (rows columns, 3), about any axis."""
-    theta, phi = theta[:, None], phi[None]
-    x, y, z = np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi
-    return np.stack([x, y, z], axis=-1).reshape(-1, 3)

@@ -211,7 +211,8 @@ class TranslucentObjects:
         if not current:
             if not (objects and same):
                 self.choices = choices_of(scene, self.settings, self.choose)
-            self._made = mark, shapes, make_objects(scene, self.settings, self.choices)
+            settings = replace(self.settings, light=self.choices.light)
+            self._made = mark, shapes, make_objects(scene, settings, self.choices)
         self._places = places
         return self._made[2]
 

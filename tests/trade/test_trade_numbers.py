@@ -8,13 +8,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from benchmarks.long_runs import assessment_of
 from full_geometry.cli import trade
 from full_geometry.integrators.gathering import PART, Gathered, Gathering
 from full_geometry.trade import recommend
 from full_geometry.trade.advice import advise
 from full_geometry.trade.assessing import contenders, left_out, most_promising
-from full_geometry.trade.automatic import picked, walks_of
+from full_geometry.trade.automatic import decision_of, picked
 from full_geometry.trade.results import Assessment, ObjectTrade, TechniqueTrade, samples_for
 from full_geometry.trade.statistics import (
     FIREFLIES,
@@ -22,6 +21,7 @@ from full_geometry.trade.statistics import (
     RadianceEstimate,
     mean_square,
     mean_square_of_parts,
+    mean_square_to_parts,
     noise_of_parts,
     relative_variance,
     with_prior,
@@ -216,38 +216,61 @@ def test_auto_takes_the_cheapest_that_keeps_and_says_when_walks_are_better() -> 
     assert picked(found, 0.1).model == "neural"
     least = picked(_assessment(CHEAP).objects[0], 0.1)
     assert least.model == "lambert" and "translucent_walk would be better" in least.sentence
-    assert least.seconds == math.inf
+    assert least.seconds == math.inf and not least.keeps
+
+
+def test_auto_takes_no_model_whose_error_may_be_above_the_tolerance() -> None:
+    doubtful = TechniqueTrade("better_dipole", 0.09**2, 0.03**2, (1.0,), (0.0,), 1.0, 0.0, 1e-9, 100)
+    assert picked(_assessment(doubtful).objects[0], 0.1).keeps
+    assert not picked(_assessment(doubtful).objects[0], 0.094).keeps  # 0.09² + 0.03² is 0.0949²
+    assert decision_of(advise(_assessment(doubtful), Job(0.094))).walks == Technique.of("path_traced")
 
 
 def test_auto_takes_gathered_light_only_where_it_is_asked_for_and_counts_its_preparation() -> None:
     gathered = _way("neural, gathered", 0.01, 0.01, 1e-8, preparation=4.0)
     found = _assessment(GOOD, gathered).objects[0]  # 100 pixels, variance 1
-    assert picked(found, 0.1).seconds == pytest.approx(100 * 100 * 2e-6)
-    assert picked(found, 0.1, "gathered").seconds == pytest.approx(4.0 + 100 * 100 * 1e-8)
+    spp = math.ceil(samples_for(GOOD, 0.1))
+    assert picked(found, 0.1).seconds == pytest.approx(100 * spp * 2e-6)
+    assert picked(found, 0.1, "gathered").seconds == pytest.approx(4.0 + 100 * spp * 1e-8)
     assert picked(found, 0.1, "gathered").sentence.startswith("object 'ball': neural, gathered, < 1.6 % off")
 
 
+DENOISED = "path_traced, precomputed, denoised"
+
+
 @pytest.mark.parametrize(
-    ("ways", "light", "why"),
-    [([GOOD], "", ""), ([CHEAP], "sampled", ", light sampled, is the cheapest that keeps 10 %: 0.1 s an image"),
-     ([GOOD, ("path_traced, precomputed", 0.0, 0.0, 1e-7)], "precomputed", "keeps 10 %: 0.001 s an image")],
+    ("ways", "walks", "light", "spp"),
+    [
+        ([GOOD], None, "sampled", 103),
+        ([CHEAP], "path_traced", "sampled", 100),
+        ([GOOD, ("path_traced, precomputed", 0.0, 0.0, 1e-7)], "path_traced, precomputed", "precomputed", 100),
+        ([GOOD, ("better_dipole, corrected", 0.0, 0.0, 1e-7)], None, "corrected", 100),
+        ([GOOD, TechniqueTrade(DENOISED, 0.008, 0.001, (1.0,), (0.0,), 0.0, 0.0, 1e-7, 100, least=16)], DENOISED,
+         "precomputed", 16),
+    ],
 )  # fmt: skip
-def test_auto_of_the_command_walks_where_that_is_the_cheapest_way(ways: list, light: str, why: str) -> None:
+def test_auto_of_the_command_takes_the_cheapest_of_all_ways(
+    ways: list, walks: str | None, light: str, spp: int
+) -> None:
     found = _assessment(*(each if isinstance(each, TechniqueTrade) else _way(*each) for each in ways))
-    told = walks_of(advise(found, Job(0.1)))
-    assert told[0] == light and told[1].endswith(why)
+    told = decision_of(advise(found, Job(0.1)))
+    assert (told.walks, told.light, told.spp) == (walks and Technique.of(walks), light, spp)
+    assert "the cheapest that keeps 10 %" in told.why
 
 
 def test_auto_walks_with_sampled_light_where_nothing_is_known_to_keep_the_tolerance() -> None:
     blurred = _way("path_traced", 0.2, 0.01, 1e-5)
     found = ObjectTrade("ball", (30.0, 40.0), 0.5, 100.0, (1.0,), (blurred,))
-    light, why = walks_of(advise(Assessment((found,), 1.0, 0.0, 0), Job(0.1)))
-    assert light == "sampled" and why == "path_traced, light sampled, as nothing is known to keep 10 %"
+    told = decision_of(advise(Assessment((found,), 1.0, 0.0, 0), Job(0.1)))
+    assert told[1:] == ("sampled", None, "path_traced, light sampled, as nothing is known to keep 10 %")
 
 
-def test_auto_knows_where_no_model_keeps_the_tolerance() -> None:
-    assert picked(_assessment(CHEAP).objects[0], 0.1).is_wrong
-    assert not picked(_assessment(CHEAP).objects[0], 0.2).is_wrong
+def test_corrected_light_is_looked_at_by_its_chance() -> None:
+    found = _assessment(_way("better_dipole", 0.3, 0.01, 1e-6), TechniqueTrade("neural", refusal="no")).objects[0]
+    corrected = Technique.of("better_dipole, corrected")
+    assert left_out(found, corrected, Job(0.1, 100_000), 4.0) == ""
+    assert left_out(found, corrected, Job(0.02, 100_000), 4.0).endswith("is so right: ask for it by its name")
+    assert "not measured" in left_out(found, corrected, Job(0.1), 4.0)  # walks take a tenth of a second
 
 
 def test_a_bias_that_contradicts_what_was_known_is_told_as_measured() -> None:
@@ -259,7 +282,15 @@ def test_a_bias_that_contradicts_what_was_known_is_told_as_measured() -> None:
 
 @pytest.mark.parametrize(
     "way",
-    ["path_traced", "path_traced, precomputed", "neural", "neural, gathered", "neural, corrected"],
+    [
+        "path_traced",
+        "path_traced, precomputed",
+        "path_traced, denoised",
+        "path_traced, precomputed, denoised",
+        "neural",
+        "neural, gathered",
+        "neural, corrected",
+    ],
 )
 def test_a_way_comes_back_by_its_name(way: str) -> None:
     assert Technique.of(way).name == way
@@ -267,7 +298,8 @@ def test_a_way_comes_back_by_its_name(way: str) -> None:
 
 @pytest.mark.parametrize(
     "unknown",
-    ["lambert, gathered", "lambert, corrected", "neural, collected", "neural, precomputed", "path_traced, gathered"],
+    ["lambert, gathered", "lambert, corrected", "neural, collected", "neural, precomputed", "path_traced, gathered",
+     "neural, denoised"],
 )  # fmt: skip
 def test_a_way_that_does_not_exist_is_refused(unknown: str) -> None:
     with pytest.raises(ValueError, match="light of"):
@@ -277,7 +309,8 @@ def test_a_way_that_does_not_exist_is_refused(unknown: str) -> None:
 @pytest.mark.parametrize(
     ("way", "flags"),
     [("path_traced", "--model path_traced --light sampled"), ("neural, gathered", "--model neural --light gathered"),
-     ("path_traced, precomputed", "--model path_traced --light precomputed"), ("lambert", "--model lambert")],
+     ("path_traced, precomputed", "--model path_traced --light precomputed"), ("lambert", "--model lambert"),
+     ("path_traced, precomputed, denoised", "--model path_traced --light precomputed --denoise")],
 )  # fmt: skip
 def test_the_flags_of_a_way_ask_for_that_way(way: str, flags: str) -> None:
     assert Technique.of(way).flags == flags
@@ -288,6 +321,22 @@ def test_precomputed_walks_serve_all_objects_where_they_are_the_cheapest() -> No
     found = recommend(_assessment(GOOD, walks), tolerance=0.02, images=1000)
     assert found.integrator == found.objects[0].way == "path_traced, precomputed"
     assert "--model path_traced --light precomputed" in str(found)
+
+
+def test_a_bias_is_told_by_two_parts_of_walks_without_their_noise() -> None:
+    rng, found, single = np.random.default_rng(11), [], []
+    off, own, kept = 0.1, 0.2, 0.15
+    for _ in range(SEEDS):
+        truth = 1 + 0.3 * rng.standard_normal((3, EXITS))
+        light = [truth * (1 + own * rng.standard_normal(truth.shape)) for _ in range(2)]  # of precomputed light
+        walks = [_estimate(rng, each, 0.5) for each in light]
+        parts = [_estimate(rng, truth * (1 + off) + own * rng.standard_normal(truth.shape), 0.1) for _ in range(2)]
+        found.append(mean_square_to_parts(parts, walks, kept))
+        single.append(mean_square_to_parts([_estimate(rng, truth * (1 + off), 0.5)], walks, 0.0))
+    for numbers, expected in ((found, off**2 * (1 + 0.3**2) + kept * own**2), (single, off**2 * (1 + 0.3**2))):
+        values, errors = np.array(numbers).T
+        assert abs(values.mean() - expected) < 4 * values.std() / math.sqrt(SEEDS)  # 4 standard errors
+        assert 0.85 < errors.mean() / values.std() < 1.15
 
 
 def test_the_noise_of_precomputed_light_is_told_by_two_parts_and_is_no_bias() -> None:
@@ -303,7 +352,7 @@ def test_the_noise_of_precomputed_light_is_told_by_two_parts_and_is_no_bias() ->
 
 def test_a_record_comes_back_as_it_was() -> None:
     found = _assessment(CHEAP, GOOD)
-    assert assessment_of(found.record()) == found
+    assert Assessment.from_record(found.record()) == found
 
 
 @pytest.mark.parametrize(

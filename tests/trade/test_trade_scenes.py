@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +13,12 @@ from render_files import XML
 from typer.testing import CliRunner
 
 from figures import app as cli
-from full_geometry.trade import assess, automatic, flat, measuring, recommend, recommend_flat, sampling
+from full_geometry.trade import assess, automatic, flat, measuring, recommend, recommend_flat
 from full_geometry.trade.assessing import assess_stage
 from full_geometry.trade.images import small_images
+from full_geometry.trade.results import Assessment, ObjectTrade, TechniqueTrade, samples_for
 from full_geometry.trade.sampling import first_sample, sample_more, visible_exits
-from full_geometry.trade.techniques import PRECOMPUTED_WALKS, WALKS, Effort, Job, Technique, stage
-from full_geometry.transport.models import model_names
+from full_geometry.trade.techniques import DENOISED_WALKS, PRECOMPUTED_WALKS, WALKS, Effort, Job, Technique, stage
 from halfspace_sss import Medium
 from halfspace_sss.physics.fresnel import F_r
 
@@ -178,47 +179,22 @@ def windows() -> np.ndarray:
     return pixels
 
 
-def test_the_second_look_goes_on_with_the_samples_of_the_first_and_tells_biases_by_a_smoothed_environment(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    lit = stage(scene(light={"type": "envmap", "bitmap": mi.Bitmap(windows())}, orders="multiple")).scene
-    pixels = np.array(mi.traverse(lit.environment())["data"])
+def test_the_second_look_goes_on_with_the_samples_of_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
     known: list[tuple[Technique, int, Any]] = []
-    shown: list[tuple[bool, float]] = []
 
     def noted(on: Any, way: Technique, points: Any, sampled: Any, *args: Any, **more: Any) -> None:
         known.append((way, sampled.estimate.samples, sampled))
         sample_more(on, way, points, sampled, *args, **more)
 
-    def launched(on: Any, way: Technique, *args: Any) -> Any:
-        result = launch(on, way, *args)
-        shown.append((way.smoothed, float(np.array(mi.traverse(lit.environment())["data"]).max())))
-        return result
-
-    launch = sampling._launch
     monkeypatch.setattr(measuring, "sample_more", noted)
-    monkeypatch.setattr(sampling, "_launch", launched)
     asked = ["better_dipole", "better_dipole, gathered"]
-    found = assess(lit, models=asked, job=Job(0.05), **QUICK).objects[0]
-    counts = [samples for way, samples, _ in known if way == Technique("path_traced", smoothed=True)]
-    (walks,) = {sampled for way, _, sampled in known if way == Technique("path_traced", smoothed=True)}
+    found = assess(scene(orders="multiple"), models=asked, job=Job(0.05), **QUICK).objects[0]
+    counts = [samples for way, samples, _ in known if way == WALKS]
+    (walks,) = {sampled for way, _, sampled in known if way == WALKS}
     assert counts == sorted(counts) and 0 < counts[0] < walks.estimate.samples
-    assert all((brightest < 9) == soft for soft, brightest in shown)
-    assert np.array_equal(np.array(mi.traverse(lit.environment())["data"]), pixels)
     sampled, gathered = (found.way(name) for name in asked)
     error = np.hypot(sampled.ratio_error, gathered.ratio_error)
     assert np.all(np.abs(np.subtract(sampled.ratio, gathered.ratio)) < 4 * error + 0.03)
-
-
-def test_soft_light_keeps_the_mean_and_the_first_moment_of_an_environment() -> None:
-    from full_geometry.trade.techniques import smoothed
-
-    own = np.concatenate([windows()[:, -1:], windows(), windows()[:, :1]], axis=1)
-    theta, phi = np.linspace(0, np.pi, 32)[:, None], (np.arange(64) + 0.5) * np.pi / 32
-    moments = np.stack([np.ones((32, 64)), np.cos(theta) + 0 * phi, np.sin(theta) * np.cos(phi)]) * np.sin(theta)
-    before, after = (np.tensordot(moments, of[:, 1:-1], 2) / moments[0].sum() for of in (own, smoothed(own)))
-    assert np.allclose(after, before, atol=0.02 * before[0].max()) and 0 <= smoothed(own).min()
-    assert smoothed(own).max() < 0.6 * own.max()
 
 
 def test_a_point_through_which_a_lamp_would_be_seen_is_left_out() -> None:
@@ -255,7 +231,7 @@ def test_corrected_light_has_a_fifth_of_the_bias_of_gathered_light_at_most() -> 
     )
     assert gathered.bias2 > 0.15**2
     assert np.sqrt(max(corrected.bias2 - 3 * corrected.bias2_error, 0)) < np.sqrt(gathered.bias2) / 5
-    assert corrected.preparation > gathered.preparation
+    assert corrected.seconds > gathered.seconds  # by its walks
 
 
 def test_walks_refuse_to_precompute_light_where_that_cannot_be() -> None:
@@ -280,29 +256,52 @@ def test_light_that_is_kept_for_samples_is_precomputed_anew_where_an_emitter_has
     assert means[1] == pytest.approx(2 * means[0], rel=0.02)  # the same walks in the noise of another fill
 
 
-def test_auto_of_the_command_walks_and_finds_its_choice_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def _found(*ways: tuple[str, float, float]) -> Assessment:
+    """An assessment of names, bias² and seconds of a sample."""
+    rows = (TechniqueTrade(name, bias2, 0.0, (1.0,), (0.0,), 1.0, 0.0, cost, 100) for name, bias2, cost in ways)
+    return Assessment((ObjectTrade("ball", (30.0, 40.0), 0.5, 100.0, (1.0,), tuple(rows)),), 1.0, 0.0, 0)
+
+
+CHANCE, QUICKER = ("path_traced", 0.0, 1e-5), ("path_traced, precomputed", 0.0, 1e-6)
+
+
+@pytest.mark.parametrize("arguments", [["--model", "auto", "--spp", "1"], ["--target-error", "0.5"]])
+def test_the_command_takes_the_cheapest_way_where_that_is_left_to_it_and_finds_it_again(
+    arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "ball.xml").write_text(XML)
-    told, known = ("precomputed", "path_traced, light precomputed, is the cheapest"), []
-    monkeypatch.setattr(automatic, "assess_for", lambda *args: known.append(args))
-    monkeypatch.setattr(automatic, "advise", lambda *args: None)
-    monkeypatch.setattr(automatic, "walks_of", lambda *args: told)
+    named = "--model" in arguments
+    unnamed = re.sub(r'<integrator.*?</integrator>|<string name="model"[^>]*>', "", XML)
+    (tmp_path / "ball.xml").write_text(XML if named else unnamed)
+    known = []
+    monkeypatch.setattr(automatic, "assess_for", lambda *args: known.append(args) or _found(CHANCE, QUICKER))
     for _ in range(2):
-        result = CliRunner().invoke(cli.app, ["render", "ball.xml", "--model", "auto", "--spp", "1"])
-        assert result.exit_code == 0 and told[1] in result.output
-    about = json.loads((tmp_path / "render" / "ball_auto.json").read_text())
+        result = CliRunner().invoke(cli.app, ["render", "ball.xml", *arguments])
+        assert result.exit_code == 0, result.output
+        assert "path_traced, precomputed: the cheapest that keeps" in " ".join(result.output.split())
+    about = json.loads((tmp_path / "render" / f"ball_{'auto' if named else 'scene'}.json").read_text())
     assert "TranslucentWalk" in about["integrator"] and len(known) == 1
-    assert [each.name for each in known[0][1]][:3] == ["path_traced", "path_traced, precomputed", "lambert"]
-
-
-RECORD = {"format": automatic.FORMAT, "light": "sampled", "models": ["neural"], "sentences": [""], "refusal": ""}
+    ways = [each.name for each in known[0][1]]
+    assert ways[:2] == ["path_traced", "path_traced, precomputed"]
+    assert (ways[2:] == ["better_dipole, corrected"]) != named
+    assert known[0][2].tolerance == (0.05 if named else 0.5)
 
 
 def test_auto_inside_the_integrator_of_models_refuses_what_none_of_them_keeps(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(automatic, "_measured", lambda *args: {**RECORD, "refusal": "a model must keep the tolerance"})
+    monkeypatch.setattr(automatic, "assess_for", lambda *args: _found(CHANCE, ("neural", 0.01, 1e-7)))
     loaded = mi.load_dict(scene(model="auto"))
-    with pytest.raises(ValueError, match="a model must keep the tolerance"):
+    with pytest.raises(ValueError, match="a model must be known to keep the tolerance 0.05, or be named"):
         loaded.integrator().prepare(loaded)
+
+
+def test_auto_takes_corrected_light_of_a_clear_object(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Objects are made for the light that is chosen: gathered light of this one is refused."""
+    monkeypatch.setattr(automatic, "assess_for", lambda *args: _found(CHANCE, ("better_dipole, corrected", 0.0, 1e-8)))
+    described = scene({"sigma_s": 0.3, "sigma_a": 0.02}, model="auto")
+    described["integrator"]["light"] = "auto"
+    loaded = mi.load_dict(described)
+    (obj,) = loaded.integrator().prepare(loaded)
+    assert loaded.integrator().choices.light == "corrected" and obj.gathered is not None
 
 
 def _painted(*albedos: float) -> dict[str, Any]:
@@ -343,37 +342,36 @@ def test_an_unknown_way_is_refused_with_the_nearest() -> None:
 
 
 @pytest.mark.slow
-def test_auto_is_chosen_of_all_models_once_kept_and_found_again(tmp_path: Path) -> None:
+def test_auto_is_chosen_once_kept_and_found_again(tmp_path: Path) -> None:
     names = []
+    asked = scene({"sigma_s": 95.0, "sigma_a": 5.0}, model="auto")
+    asked["integrator"]["tolerance"] = 0.3
     for _ in range(2):
-        loaded = mi.load_dict(scene(model="auto"))
+        loaded = mi.load_dict(asked)
         loaded.integrator().prepare(loaded)
         names.append(loaded.integrator().choices.models[0])
-    files = list((tmp_path / "choices").iterdir())
-    assert names[0] == names[1] != "auto" and len(files) == 1
-    record = json.loads(files[0].read_text())
-    assert record["models"] == [names[0]] and record["sentences"][0].startswith("object 'ball0'")
-    measured = {row["way"] for row in record["assessment"]["objects"][0]["ways"]}
-    assert measured == {"path_traced", *model_names()} - {"auto"}
-    files[0].write_text(files[0].read_text().replace(f'"{names[0]}"', '"standard_dipole"', 1))
-    pinned = mi.load_dict(scene(model="auto"))
-    assert mi.render(pinned, spp=1).shape == (64, 64, 3)
-    assert pinned.integrator().choices.models[0] == "standard_dipole"
-    assert pinned.shapes()[0].bsdf().spec.model == "auto"
-    files[0].write_text("{}")
+    (file,) = (tmp_path / "choices").iterdir()
+    assert names[0] == names[1] != "auto"
+    assert loaded.integrator().choices.sentences["ball0"].startswith("object 'ball0'")
+    assert loaded.shapes()[0].bsdf().spec.model == "auto"
+    file.write_text("{}")
     with pytest.raises(ValueError, match="delete it to choose anew"):
-        damaged = mi.load_dict(scene(model="auto"))
+        damaged = mi.load_dict(asked)
         damaged.integrator().prepare(damaged)
 
 
-@pytest.mark.parametrize(("share", "spp", "samples"), [(0.0, 4, 64), (0.5, 256, 1365), (1.0, 1024, 2048)])
-def test_the_choice_takes_its_share_of_the_samples_of_an_image(share: float, spp: int, samples: int) -> None:
-    from full_geometry.trade.automatic import _samples
-    from full_geometry.trade.techniques import stage
-
-    asked = scene(model="auto")
-    asked["sensor"]["sampler"] = {"type": "independent", "sample_count": spp}
-    assert _samples(stage(asked), share / 4) == samples  # 64² pixels, 96 exits, 4 ways
+def test_denoised_walks_are_told_with_what_is_left_of_their_noise() -> None:
+    pytest.importorskip("mitsuba_oidn")
+    lit = scene(light={"type": "envmap", "bitmap": mi.Bitmap(windows())})
+    lit["sensor"]["film"]["rfilter"] = {"type": "box"}
+    ways = [WALKS, PRECOMPUTED_WALKS, DENOISED_WALKS[1]]
+    found = assess_stage(stage(lit), ways, Effort(1.0, exits=64)).objects[0]
+    plain, row = (found.way(way.name) for way in ways[1:])
+    assert row.variance == 0 and row.least >= 8 and samples_for(row, 10.0) == row.least
+    assert max(plain.bias2, 0) - 4 * row.bias2_error < row.bias2 < plain.variance / row.least + 4 * row.bias2_error
+    gaussian = stage(scene())
+    refused = assess_stage(gaussian, [WALKS, DENOISED_WALKS[0]], Effort(samples=48, exits=32)).objects[0]
+    assert refused.way("path_traced, denoised").refusal == "the film must have a box filter for a denoiser"
 
 
 def test_half_precision_of_a_network_is_measured_beside_single() -> None:
