@@ -173,7 +173,7 @@ def _off(scene: mi.Scene, image: np.ndarray, sensor: int, model: str | None) -> 
 
 
 @dataclass(frozen=True)
-class _Way:
+class _Render:
     """A scene as it is rendered, what ends that, and whether it is denoised."""
 
     scene: mi.Scene
@@ -184,7 +184,7 @@ class _Way:
 def _way(
     scene: Path, transport: TransportOptions, until: UntilOptions, parameters: dict[str, str],
     denoising: tuple[bool, bool],
-) -> _Way:  # fmt: skip
+) -> _Render:  # fmt: skip
     """The scene by what is named, or by the cheapest way that keeps the asked error: of all for the model "auto".
 
     Where neither scene nor options name anything, and an error or no end at all is asked for, it is the cheapest of
@@ -213,7 +213,7 @@ def _way(
     unnamed = named == (None, None, None) and (error or not ended) and names_nothing(scene, parameters)
     unnamed &= all(any(shape is each for each in loaded.shapes()) for shape in translucent_shapes(loaded))
     if mi.is_spectral or not (by_models or unnamed):
-        return _Way(loaded, until.limits(), denoise)
+        return _Render(loaded, until.limits(), denoise)
 
     # ---- the way, and what ends it
     how = integrator.settings if by_models else Settings(mm_per_unit=integrator.mm_per_unit, tolerance=error or ASKED)
@@ -227,11 +227,11 @@ def _way(
     elif not ended and not (found.walks and error):  # an error that is asked for is told of walks while they go on
         limits = replace(limits, spp=found.spp, target_error=None)
     if by_models and found.walks is None:  # the integrator finds again which models these are
-        return _Way(loaded, limits, denoise)
+        return _Render(loaded, limits, denoise)
     denoise |= found.walks is not None and found.walks.denoised
     settings = {**transport.settings(denoise), "light": found.light}
     model = PATH_TRACED if found.walks else READY_FIRST
-    return _Way(open_scene(scene, model, transport.orders, parameters, settings), limits, denoise)
+    return _Render(open_scene(scene, model, transport.orders, parameters, settings), limits, denoise)
 
 
 def _sensors(text: str, scene: mi.Scene) -> list[int]:

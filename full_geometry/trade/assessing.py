@@ -150,8 +150,7 @@ def assess_for(
         samples.run(chosen, budget or RunBudget(), seeded(effort.seed, number), progress)
 
     # Run walks twice, as the first launch tells little of time.
-    walks = [t for t in ahead if t.walks]
-    run(walks, 46)
+    run(walks := [t for t in ahead if t.walks], 46)
     run(walks, 44, RunBudget(len(walks) * WALKED_FIRST, traced=1 / len(walks)))
     _denoise(samples, chosen, effort.seconds, job.tolerance, every)
     out: dict[Technique, str] = {}
@@ -159,8 +158,7 @@ def assess_for(
         run(ahead, 42, RunBudget(FIRST_SHARE * effort.seconds, traced=TRACED_SHARE))
     else:
         # Leave out what trains for longer than walks need for the job, with the points that its noise allows.
-        first = samples.assessment()
-        out |= too_dear(samples, first, chosen, job)
+        out |= too_dear(samples, first := samples.assessment(), chosen, job)
         ahead, later = ([t for t in some if t not in out] for some in (ahead, later))
         samples.keep(first)
         # Run one model of the half-space; where it is far off the others are left out, as they err alike.
@@ -174,13 +172,12 @@ def assess_for(
     if not seen:
         return first
 
-    references = {samples.reference(k) for k in seen}
-
     def left_of(assessed: Assessment) -> float:
         return max(effort.seconds - assessed.seconds / len(seen), 0.0)
 
     def look(assessed: Assessment) -> tuple[list[Technique], Technique | None, dict[Technique, str]]:
-        return promising([assessed.objects[k] for k in seen], ahead, later, job, effort.seconds, references)
+        of, references = [assessed.objects[k] for k in seen], {samples.reference(k) for k in seen}
+        return promising(of, ahead, later, job, effort.seconds, references)
 
     # Spend the time that is left, less what the most promising gathering takes, on walks and those that may win.
     few, gathering, _ = look(first)
