@@ -145,7 +145,7 @@ def cancellable(cancelled: Callable[[], bool]) -> Iterator[None]:
 
 
 def checkpoint() -> None:
-    """Between parts of long work, each of which leaves what is known whole: end here if that is cancelled."""
+    """End here if the work is cancelled; call it between parts of long work that leave all results whole."""
     if _cancelled.get()():
         raise KeyboardInterrupt
 

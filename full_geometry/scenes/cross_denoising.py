@@ -75,7 +75,7 @@ class Halves(NamedTuple):
 
     @property
     def share(self) -> float:
-        """s, by which the noisy halves join the denoised ones."""
+        """The share s of the noisy halves beside the denoised ones."""
         e, V = max(float(np.sum(self._held())), 0.0), float((self.V_A + self.V_B).sum())
         return e / (e + V) if e + V > 0 else 0.0
 

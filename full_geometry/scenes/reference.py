@@ -66,7 +66,7 @@ def render(
         resume: True goes on with the file at `path` if there is one, False begins anew, another path goes on with the
             file there and leaves it as it is.
         progress: called after each pass.
-        denoise: a denoiser, by which the halves of the samples are kept and `target_error` is the error of the denoised
+        denoise: a denoiser; then halves of the samples are kept, and `target_error` is the error of the denoised
             image, see `cross_denoising`.
         limits: fields of `Limits`, one of `spp`, `passes`, `target_error` and `seconds` at least.
 

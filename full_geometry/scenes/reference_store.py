@@ -2,8 +2,8 @@
 picture.
 
 Each quantity q is two float32 channels, q and q.rest, whose sum holds 48 bits: the state after a pass is rounded to
-that, so that a run that is read back goes on with the same numbers as one that was never interrupted. The mean of half
-of the passes, by which a denoiser is held to the other half, is in the file where it was asked for.
+that, so that a run that is read back goes on with the same numbers as one that was never interrupted. For
+denoised renders the file also has the mean of half of the passes.
 """
 
 from __future__ import annotations
