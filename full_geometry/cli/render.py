@@ -276,6 +276,8 @@ def _rendered(scene: mi.Scene, file: Path, limits: Limits, which: dict[str, Any]
     with bars:
         try:
             return online.render(scene, part, resume=start, **which, **vars(limits), listeners=bars.listeners())
+        except ValueError:  # a refusal, which may be a RuntimeError too
+            raise
         except RuntimeError as error:
             raise BackendError(first_cause(error)) from error
         except KeyboardInterrupt:

@@ -36,8 +36,7 @@ _TRACEBACK = "Traceback (most recent call last):"
 
 def first_cause(error: BaseException) -> str:
     """One line: where in the scene file, if that is known, and what was wrong there first."""
-    while error.__cause__ is not None or error.__context__ is not None:
-        error = error.__cause__ or error.__context__
+    error = _first(error)
     text = str(error)
     place = _PLACE.search(text)
     if _EMPTY.search(text):
@@ -52,6 +51,22 @@ def first_cause(error: BaseException) -> str:
         text = _SOURCE.sub("", text)
     line = " ".join(text.split()) or type(error).__name__
     return f"{place[1]}: {line}" if place and place[1] != '"root"' else line
+
+
+def _first(error: BaseException) -> BaseException:
+    """A refusal by this project that others have wrapped; without one, where the chain of errors began."""
+    while not _is_refusal(error) and (error.__cause__ or error.__context__):
+        error = error.__cause__ or error.__context__
+    return error
+
+
+def _is_refusal(error: BaseException) -> bool:
+    """Whether it is a ValueError that was raised in a file of this project."""
+    files, place = [], error.__traceback__
+    while place is not None:
+        files.append(place.tb_frame.f_code.co_filename)
+        place = place.tb_next
+    return isinstance(error, ValueError) and bool(files) and files[-1].startswith(_HERE)
 
 
 class SceneError(ValueError, RuntimeError):
@@ -86,14 +101,9 @@ def _is_ours(error: BaseException) -> bool:
 
     A mesh without faces counts too: what Mitsuba says of it says nothing.
     """
-    while error.__cause__ is not None or error.__context__ is not None:
-        error = error.__cause__ or error.__context__
+    error = _first(error)
     if isinstance(error, ValueError):
-        files, place = [], error.__traceback__
-        while place is not None:
-            files.append(place.tb_frame.f_code.co_filename)
-            place = place.tb_next
-        return bool(files) and files[-1].startswith(_HERE)
+        return _is_refusal(error)
     text = str(error)
     if _EMPTY.search(text):
         return True

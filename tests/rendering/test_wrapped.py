@@ -162,6 +162,13 @@ def test_what_cannot_be_right_is_refused_by_name(why):
         scene.integrator().prepare(scene)
 
 
+def test_what_walks_refuse_while_they_render_is_said_in_place_of_what_mitsuba_makes_of_it():
+    bsdf, _, message = REFUSED["no slopes"]
+    scene = {"type": "scene", "integrator": {"type": "translucent_walk"}, "object": {**BALL, "bsdf": bsdf()}}
+    with pytest.raises(ValueError, match=f"^{message}"):
+        mi.render(mi.load_dict({**scene, "sensor": {"type": "perspective"}}), spp=1)
+
+
 def test_a_mask_on_what_holds_something_and_a_map_without_uv_are_refused(tmp_path):
     masked = {"type": "mask", "opacity": 0.5, "of": PLAIN}
     scene = {"type": "scene", "object": {**BALL, "bsdf": masked}, "stone": {"type": "sphere", "radius": 1.0}}
