@@ -22,7 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.geometry.light_points import lattice, uniform_entries
-from full_geometry.geometry.points import cosine_above, place
+from full_geometry.geometry.points import cosine_above, floats, place
 from full_geometry.geometry.rounding import ray_from
 from full_geometry.geometry.snapshot import same_objects
 from full_geometry.integrators.gathering import Gathered
@@ -91,7 +91,7 @@ class SurfaceCorrection:
         values = self.values / scale_of(self.gathered)[:, None]
         known = np.array(self.gathered.values).reshape(*values.shape[:2], self.gathered.terms)
         values[:, :, : self.gathered.terms] += known
-        return replace(self.gathered, values=mi.Float(values.astype(np.float32).ravel()))
+        return replace(self.gathered, values=floats(values))
 
     @property
     def told(self) -> str:
@@ -193,7 +193,7 @@ def residuals(
     # ---- places uniform over the area, directions by the cosine, of one lattice
     obj, gathered = objects[k], objects[k].gathered
     u = lattice(PER_LAUNCH, ROOTS, np.random.default_rng(seed).random(5))
-    u = [mi.Float(np.minimum(v, 1 - 2**-24).astype(np.float32)) for v in u]
+    u = [floats(np.minimum(v, 1 - 2**-24)) for v in u]
     at = uniform_entries(obj.geometry, u[0], mi.Point2f(u[1], u[2]))
     w, _ = cosine_above(at.n_out, at.n, mi.Point2f(u[3], u[4]))
     ray = ray_from(place(at.p, at.n), w, obj.geometry.clearance)

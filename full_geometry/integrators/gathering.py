@@ -22,7 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.geometry.light_points import GOLDEN, SurfacePoints
-from full_geometry.geometry.points import cosine_above, of_rows, opaque, place
+from full_geometry.geometry.points import cosine_above, floats, of_rows, opaque, place
 from full_geometry.geometry.rounding import blocked, ray_from
 from full_geometry.geometry.snapshot import Snapshot, same_objects
 from full_geometry.integrators.fine_light import fine_light
@@ -264,7 +264,7 @@ def _leaving(
     # ---- J at events inside, with what other surfaces send to the points
     inner = None
     if events is not None:
-        seen = mi.Float(np.mean(others, axis=0).astype(np.float32).ravel())
+        seen = floats(np.mean(others, axis=0))
         inner = inner_light(scene, objects, k, settings, events, (T.points, seen))
 
     # ---- B = T (L - c) + c, c the mean of the environment where alpha is known
@@ -283,7 +283,7 @@ def _leaving(
         B += T.beyond(direct.astype(np.float32), rays)
 
     # ---- four numbers for each channel of a point, as data of a kernel
-    values = mi.Float(B.astype(np.float32).ravel())
+    values = floats(B)
     return Gathered(
         object=obj,
         points=T.points,

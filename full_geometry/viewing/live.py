@@ -151,11 +151,13 @@ class LiveScene:
         if edits.environment and edits.environment not in self.environments():
             raise ValueError(f"environment must be a map in the folder of the scene, got {edits.environment!r}")
         fresh = self._open(edits)
-        if not _brought(self.scene, fresh):
-            # objects have the numbers of those before once these are gone, and kernels that know them are found again
-            del fresh
+        # kernels know the numbers of all objects that are there: those of one scene only are found again
+        kept = _brought(self.scene, fresh)
+        del fresh
+        if not kept:
             self.scene, self._integrators = None, {}
-            gc.collect()
+        gc.collect()
+        if not kept:
             self.scene = self._open(edits)
         self.edits = edits
 
