@@ -67,7 +67,7 @@ class Halves(NamedTuple):
 
     @classmethod
     def of(cls, found: Reference, denoise: Denoise) -> Halves:
-        """Of a render with halves, of two passes at least."""
+        """The halves of a render of at least two passes."""
         # the variance of one sample is that of the mean times the samples
         n, spp, variance = found.half_spp, found.spp, found.variance[..., :3]
         A, B = found.half, (spp * found.mean - n * found.half) / (spp - n)

@@ -27,7 +27,7 @@ class Edits:
     """Changes of a scene.
 
     Args:
-        turn: degrees by which all light is turned about the vertical through the objects.
+        turn: degrees, all light is turned by them about the vertical through the objects.
         tilt: and then about the horizontal across.
         stops: of the brightness of all light.
         environment: file of the environment map, "" for that of the scene.
@@ -51,7 +51,7 @@ class Camera(NamedTuple):
     height: int
 
     def sensor(self, part: int = 1) -> mi.Sensor:
-        """Of Mitsuba, with one of `part` pixels of each row and column."""
+        """A sensor of Mitsuba, with one of `part` pixels of each row and column."""
         size = {name: max(value // part, 1) for name, value in (("width", self.width), ("height", self.height))}
         film = {"type": "hdrfilm", "pixel_format": "rgb", "rfilter": {"type": "box"}, **size}
         to_world = mi.ScalarTransform4f(np.asarray(self.to_world, dtype=np.float64))
@@ -94,7 +94,7 @@ def _holds(state: ParserState, shape: mi.parser.SceneNode, k: int) -> bool:
 
 
 def name_nodes(state: ParserState) -> None:
-    """Give each nameless object a name, by which it is known again in another scene of the same file."""
+    """Give each nameless object a name, so that it is known again in another scene of the same file."""
     for k, node in enumerate(state.nodes):
         if k and not node.props.id():
             node.props.set_id(f"node_{k}")

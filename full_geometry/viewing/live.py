@@ -124,7 +124,7 @@ class LiveScene:
         return dict(zip(self.names, found))
 
     def camera(self, pixels: int) -> Camera:
-        """That of the first sensor, with about so many pixels."""
+        """The camera of the first sensor, with about so many pixels."""
         sensor = self.scene.sensors()[0]
         width, height = (int(v) for v in sensor.film().crop_size())
         parameters = mi.traverse(sensor)
