@@ -11,7 +11,6 @@ import mitsuba as mi
 import numpy as np
 
 from benchmarks.closed_shapes import write_shape
-from benchmarks.long_runs import assessment_of
 from benchmarks.trade_tables import markdown, multiples, trade_table
 from figures.computing.contenders import OF_OBJECTS
 from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training_of, weight_files, with_weights
@@ -20,6 +19,7 @@ from figures.drawing.page import page
 from figures.drawing.trade_plot import image_shots
 from figures.parts.part import Params, Part, Result, SceneDict, Task
 from full_geometry.scenes.scene_files import PATH_TRACED
+from full_geometry.trade.results import Assessment
 from full_geometry.trade.techniques import GATHERED, LAMBERT, Technique
 from halfspace_sss import materials
 from halfspace_sss.comparison.style import paper, saved
@@ -153,7 +153,7 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
         name = _name(*scene)
         if name not in results:
             continue
-        assessment = assessment_of(results[name].numbers["assessment"])
+        assessment = Assessment.from_record(results[name].numbers["assessment"])
         result[scene] = assessment.objects[0]
         shown = enumerate(results[name].numbers["shown"])
         images = {way: np.asarray(results[name].images[f"image_{k}"]) for k, way in shown}

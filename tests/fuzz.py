@@ -474,14 +474,13 @@ def run(door: str, first: int, count: int, folder: Path) -> tuple[Counter, list[
 
 
 def prepare() -> None:
-    """Mitsuba with the plugins, in silence."""
+    """Mitsuba with the plugins."""
     prepare_llvm()
     import mitsuba as mi
 
     import full_geometry
 
     mi.set_variant("llvm_ad_rgb")
-    mi.set_log_level(mi.LogLevel.Error)
     full_geometry.register()
 
 
@@ -492,6 +491,9 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0)
     options = parser.parse_args()
     prepare()
+    import mitsuba as mi
+
+    mi.set_log_level(mi.LogLevel.Error)
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         counts, wrong = run(options.door, options.first, options.count, Path(folder))

@@ -25,7 +25,6 @@ from scipy.ndimage import distance_transform_cdt, label
 
 from full_geometry.geometry.points import EntrySample, opaque
 from full_geometry.walk.media import WalkMedia
-from halfspace_sss.tracing.walk import generator, pass_seed
 
 BRICK = 4  # cells along its edge: its 64 cells are the bits of a number
 MOST_BRICKS, MOST_SLOTS = 2**24, 5 * 2**18  # of one object: h grows until it has no more
@@ -132,7 +131,7 @@ class InsideCells:
         whole &= apart <= far
         row, bit = np.nonzero(axes >= 0)
         cells = _cells_of(bricks[row], bit, counts)
-        moments = _measure(media, k, _points(cells + 0.5, low, h), axes[row, bit], h)
+        moments = _measure(media, k, cells, low, axes[row, bit], h)
         row, bit, cells, moments = (v[moments[:, 0, 0] > 1e-6] for v in (row, bit, cells, moments))
         inside[row, bit] = True
 
@@ -205,23 +204,22 @@ def brick_counts(box: tuple[np.ndarray, np.ndarray], h: float) -> np.ndarray:
 
 
 def cell_edge(
-    box: tuple[np.ndarray, np.ndarray], extent: Callable[[], tuple[float, float]], h: float, depths: tuple[float, float]
+    box: tuple[np.ndarray, np.ndarray], extent: tuple[float, float], h: float, depths: tuple[float, float]
 ) -> float:
     """h, or the least edge of cells that gives an object at most MOST_BRICKS and MOST_SLOTS.
 
     Args:
         box: its least and largest coordinates.
-        extent: its area and volume, asked only where the box could hold more cells.
+        extent: its area and volume.
         h: edge that is wanted.
         depths: as in `InsideCells.of`.
     """
     # cells of the box, else fine and coarse ones below the surface: half of the bricks that it cuts, and those near
-    known = None
+    area, volume = extent
     while True:
         if np.prod(brick_counts(box, h)) <= MOST_BRICKS:
             if np.prod((box[1] - box[0]) / h) <= MOST_SLOTS:
                 return h
-            area, volume = known = known or extent()
             near, far = (np.ceil(min(depth / (BRICK * h), 1e6)) for depth in depths)
             layers = 1 + BRICK * (0.5 + near) + BRICK * (far - near) / 8
             if min(area / h**2 * layers, volume / h**3) <= MOST_SLOTS:
@@ -441,7 +439,9 @@ def _starts_inside(media: WalkMedia, k: int, p: mi.Point3f) -> np.ndarray:
     return votes >= 2
 
 
-def _measure(media: WalkMedia, k: int, centre: mi.Point3f, axes: np.ndarray, h: float) -> np.ndarray:
+def _measure(
+    media: WalkMedia, k: int, cells: np.ndarray, low: np.ndarray, axes: np.ndarray, h: float
+) -> np.ndarray:  # fmt: skip
     """Moments (cells, 4, 4) of the inside of cells, from columns at jittered places.
 
     They run along the axis nearest to the normal of the surface, in which they are exact: what is left of their noise
@@ -450,8 +450,11 @@ def _measure(media: WalkMedia, k: int, centre: mi.Point3f, axes: np.ndarray, h: 
     n = len(axes)
     across_cell = COLUMNS[n >= FINE]
     number, edge, axis = dr.full(mi.Int32, k, n), opaque(h), mi.UInt32(axes.astype(np.uint32))
+    centre = _points(cells + 0.5, low, h)
     d = mi.Vector3f(*(dr.select(axis == a, mi.Float(1), 0) for a in range(3)))
-    rng = generator(mi, n, pass_seed(k))
+    # by the place of a cell, not by its number: rounding may add cells, and all others keep their columns
+    place = mi.Vector3u(cells.T.astype(np.uint32))
+    rng = mi.PCG32(initstate=mi.UInt64(place.x) + (mi.UInt64(place.y) << 20) + (mi.UInt64(place.z) << 40), initseq=k)
     total, side = (dr.opaque(mi.UInt32, v) for v in (across_cell**2, across_cell))
 
     def column(i: mi.UInt32, rng: mi.PCG32, sums: list[mi.Float]) -> tuple:

@@ -50,6 +50,7 @@ from full_geometry.walk.random_walk import Event, fly, free_path, pick, sample_b
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 EDGE, FORWARD_EDGE = 0.9, 0.6  # of cells, mean free paths of the light in them
+ACROSS, FINE_CELLS = 8, 2**16  # cells along the mean chord of an object, where they are so few inside
 MOST_EDGE = 1.5  # beyond, the mean of an image is more than .5 % off
 DEPTHS = 3.6, 9.0  # mean free paths below the surface, at which cells are coarse and end: e^-9 is left of light there
 ALONG, FORWARD_ALONG = 6, 1  # points on a segment of a ray; forward events part it into many
@@ -179,10 +180,6 @@ def obstacle(media: WalkMedia) -> str:
         return f"the variant {mi.variant()} has no light by channel"
     if media.inner is not None:
         return "something lies inside an object"
-    for k, kind in enumerate(media.instance_table.kind):
-        h = _grid(media, k)[1] * float(np.mean(_extinction(media, kind)))
-        if h > MOST_EDGE:
-            return f"object {media.objects[kind].name} is so many mean free paths wide that cells have {h:.2g}"
     for obj, inside, around in zip_longest(media.objects, media.specs, media.wrappings):
         if not obj.closed:
             return f"object {obj.name} is not closed"
@@ -194,6 +191,10 @@ def obstacle(media: WalkMedia) -> str:
             return f"orders of object {obj.name} are {inside.orders!r}"
         if not forward(media) and np.max(np.abs(inside.medium.g)) > MOST_TRUNCATED:
             return f"abs(g) of object {obj.name} is above {MOST_TRUNCATED} in a scene where a medium varies"
+    for k, kind in enumerate(media.instance_table.kind):
+        h = _grid(media, k)[1] * float(np.mean(_extinction(media, kind)))
+        if h > MOST_EDGE:
+            return f"object {media.objects[kind].name} is so many mean free paths wide that cells have {h:.2g}"
     return ""
 
 
@@ -213,8 +214,11 @@ def _grid(media: WalkMedia, k: int) -> tuple[tuple[np.ndarray, np.ndarray], floa
     low, high = ends_of(corners(media.objects[kind].scene.bbox(), _to_world(media, k)[None]))
     edge, extinction = FORWARD_EDGE if forward(media) else EDGE, _extinction(media, kind)
     depths = (np.inf, np.inf) if media.varies else tuple(depth / float(np.min(extinction)) for depth in DEPTHS)
-    box = low[0], high[0]
-    return box, cell_edge(box, lambda: _extent(media, k), edge / float(np.mean(extinction)), depths), depths
+    box, (area, volume) = (low[0], high[0]), _extent(media, k)
+    # thin objects have finer cells: of .9 mean free paths they left 2 % RMS of bias in images of a blob of 5.4
+    fine = max(4 * volume / (area * ACROSS), (volume / FINE_CELLS) ** (1 / 3))
+    h = min(edge / float(np.mean(extinction)), fine or np.inf)
+    return box, cell_edge(box, (area, volume), h, depths), depths
 
 
 def _extent(media: WalkMedia, k: int) -> tuple[float, float]:

@@ -22,6 +22,7 @@ WRONG = {
     "rivals": ["--scene", "none.xml"],
     "shapes": ["--objects", "-1"],
     "speeds": ["--object", "marbel"],
+    "time-to-error": ["--blocks", "0"],
     "total-error": ["--object", "marbel"],
     "trade-check": ["--scenes", "-1"],
 }

@@ -51,12 +51,13 @@ def make(name: str, medium: Medium):
 
 def test_values_stay_finite_and_not_negative_in_both_precisions(name):
     """580 queries of each of 240 media; models may refuse a medium, but not most."""
-    answered = 0
+    answered, asked = 0, 0
     for seed, medium in enumerate(media()):
+        single = query(medium, seed)
+        asked += 2 * single[0].size
         model = make(name, medium)
         if model is None:
             continue
-        single = query(medium, seed)
         S32, S64 = model.eval(*single), model.eval(*(x.astype(np.float64) for x in single))
         where = f"{medium}"
         for S in (S32, S64):
@@ -71,7 +72,7 @@ def test_values_stay_finite_and_not_negative_in_both_precisions(name):
         worst = error.argmax() if error.size else 0
         assert (error <= 1e-3).all(), (where, error.max(), [x[compared][worst] for x in single], S64[compared][worst])
         answered += S32.size + S64.size
-    assert answered >= 1e5
+    assert answered >= 0.15 * asked
 
 
 @pytest.mark.parametrize("eta", [1.0, 1.3])
