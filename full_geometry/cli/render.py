@@ -222,9 +222,9 @@ def _way(
     found = decided(loaded, how, ways)
     shared.say(found.why)
     limits = until.limits()
-    if not ended and found.spp is None:
+    if not ended and found.walks:  # their error is measured while they go on
         limits = replace(limits, spp=None, target_error=how.tolerance)
-    elif not ended and not (found.walks and error):  # an error that is asked for is told of walks while they go on
+    elif not ended:
         limits = replace(limits, spp=found.spp, target_error=None)
     if by_models and found.walks is None:  # the integrator finds again which models these are
         return _Render(loaded, limits, denoise)

@@ -126,7 +126,7 @@ WRONG = {
     "empty medium": (
         "= 10.0\nsigma_a = [0.1",
         "= 0.0\nsigma_a = [0.0",
-        "sigma_t = sigma_s + sigma_a must be finite and > 0",
+        "sigma_t = sigma_s + sigma_a must be in [1e-18, 1e+18] (1/mm), got 0.0",
     ),
     "sample without tank": ("g = [", "sample_ml = 5.0\ng = [", "key sample_ml must be at most tank_ml (None), got 5.0"),
     "source of nothing": (
