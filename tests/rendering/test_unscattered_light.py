@@ -239,7 +239,7 @@ def test_precomputed_light_has_the_mean_of_sampled_light(case: str) -> None:
         group = {"type": "shapegroup", "part": {**_ball(2.0), "bsdf": {"type": "translucent", **MEDIUM}}}
         mirror = mi.ScalarTransform4f().translate([7, 5, 3]).scale([-1, 1.5, 1])
         shown = {"type": "instance", "to_world": mirror, "group": {"type": "ref", "id": "group"}}
-        _compare(MEDIUM, 0.02, group=group, shown=shown, **lamp)
+        _compare(MEDIUM, 0.02, spp=2048, group=group, shown=shown, **lamp)
     elif case == "rough":
         _compare({**MEDIUM, "boundary": {"type": "roughdielectric", "alpha": 0.3, "int_ior": 1.4, "ext_ior": 1.0}},
                  0.02, **lamp)  # fmt: skip
