@@ -49,7 +49,9 @@ class FittedOptions:
 
 def fit(
     context: typer.Context,
-    scene: Annotated[Path, typer.Argument(help="Mitsuba XML file with the cameras, the lights and a first medium.")],
+    scene: Annotated[
+        Path, typer.Argument(help="Mitsuba XML or glTF file with the cameras, the lights and a first medium.")
+    ],
     images: Annotated[Path, typer.Option(help="JSON file of the views, see `full_geometry.inverse.read_views`.")],
     fitted: FittedOptions,
     descent: DescentOptions,
@@ -149,6 +151,10 @@ def texture_files(
 
 def scene_with_medium(scene: Path, name: str | None, found: MaterialFit, painted: dict[str, Path]) -> str | None:
     """The scene with another medium in the object; None if it is not clear which surface that is."""
+    from full_geometry.scenes.gltf import is_gltf
+
+    if is_gltf(scene):
+        return None
     root = ElementTree.parse(scene).getroot()
     shapes = [shape for shape in root.iter("shape") if name is None or shape.get("id") == name]
     own = {id(bsdf): shape for shape in shapes for bsdf in shape.iter("bsdf") if bsdf.get("type") == "translucent"}

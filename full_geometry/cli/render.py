@@ -105,7 +105,7 @@ class ImageOptions:
 
 def render(
     context: typer.Context,
-    scene: Annotated[Path, typer.Argument(help="Mitsuba XML file whose objects use the BSDF `translucent`.")],
+    scene: Annotated[Path, typer.Argument(help="Mitsuba XML or glTF file whose objects use the BSDF `translucent`.")],
     transport: TransportOptions,
     until: UntilOptions,
     images: ImageOptions,

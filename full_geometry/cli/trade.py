@@ -53,7 +53,7 @@ def trade(
     what: Annotated[
         str | None,
         typer.Argument(
-            help="A Mitsuba XML file, or a material for curves.",
+            help="A Mitsuba XML or glTF file, or a material for curves.",
             metavar="SCENE_OR_MATERIAL",
             show_default="the shipped table",
         ),

@@ -23,7 +23,7 @@ Seconds = Annotated[float, typer.Option(help="Seconds for data and fit, without 
 
 
 def train_object(
-    scene: Annotated[Path, typer.Option(help="Mitsuba XML file with the object.")],
+    scene: Annotated[Path, typer.Option(help="Mitsuba XML or glTF file with the object.")],
     on: SceneOptions,
     results: ResultOptions,
     places: shared.Places,
@@ -127,7 +127,7 @@ DEFINITION = (
 
 def errors_object(
     on: SceneOptions,
-    scene: Annotated[Path, typer.Option(help="Mitsuba XML file with the object.")],
+    scene: Annotated[Path, typer.Option(help="Mitsuba XML or glTF file with the object.")],
     object: shared.ObjectId = None,  # noqa: A002
     model: shared.Models = None,
     exits: Annotated[int, typer.Option(help="Random exits.", parser=shared.whole)] = 256,

@@ -16,7 +16,7 @@ PORT = 8080
 
 
 def view(
-    scene: Annotated[Path, typer.Argument(help="Mitsuba XML file whose objects use the BSDF `translucent`.")],
+    scene: Annotated[Path, typer.Argument(help="Mitsuba XML or glTF file whose objects use the BSDF `translucent`.")],
     options: SceneOptions,
     host: Annotated[str, typer.Option(help="Address; another than a loopback one asks for a token.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port.")] = PORT,

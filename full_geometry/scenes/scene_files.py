@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import mitsuba as mi
 
 from full_geometry.integrators.bssrdf import is_bssrdf
+from full_geometry.scenes.gltf import SUFFIXES, gltf_scene, is_gltf
 from full_geometry.settings import LIGHTS, ORDERS, PATH_TRACED, SHARED, WALK_LIGHTS, check_variant
 from full_geometry.surface.wrapped import surface_of
 from full_geometry.transport.models import model_names, of_objects
@@ -130,7 +131,7 @@ def load_scene(
     every object.
 
     Args:
-        scene: a dict as for `mitsuba.load_dict`, or the path of an XML file.
+        scene: a dict as for `mitsuba.load_dict`, or the path of an XML or glTF file.
         model: for all translucent objects, instead of what the scene says: the name of a model, or "path_traced",
             which walks through the objects instead.
         orders: of all translucent objects, instead of what the scene says.
@@ -180,7 +181,9 @@ def open_scene(
         if orders:
             props["orders"] = orders
     named = model not in (None, PATH_TRACED) or any(names) or (light is not None and light not in WALK_LIGHTS)
-    _choose_integrator(state, walks, not named, (bool(model), bool(model or orders)), settings or {})
+    own = is_gltf(scene)  # its integrator is there for its unit alone
+    by_walks, asked = walks or (own and not named), (bool(model) or own, bool(model or orders) or own)
+    _choose_integrator(state, by_walks, not named, asked, settings or {})
     for plugin, given in zip(_INTEGRATORS.values(), _settings(settings or {})):
         _set_parameters(state, plugin, given)
     _set_parameters(state, "bitmap", {"format": "variant"} if floats else {})
@@ -194,7 +197,7 @@ def names_nothing(scene: dict | str | Path, parameters: Mapping[str, str] | None
     """Whether a scene has no integrator and names no model, so that what renders it is left to us."""
     state, _ = parsed(scene, parameters or {})
     integrators = any(node.type == mi.ObjectType.Integrator for node in state.nodes)
-    return not integrators and not any("model" in props for props in _surfaces(state))
+    return (is_gltf(scene) or not integrators) and not any("model" in props for props in _surfaces(state))
 
 
 def _set_parameters(state: ParserState, plugin: str, settings: Mapping[str, float | str]) -> None:
@@ -268,11 +271,15 @@ def parsed(scene: dict | str | Path, parameters: Mapping[str, str]) -> tuple[Par
     config = mi.parser.ParserConfig(mi.variant())
     config.parallel = False  # objects then have the same numbers each time, and kernels are found in Dr.Jit's cache
     if not isinstance(scene, dict) and not Path(scene).is_file():
-        near = did_you_mean(scene, map(str, Path(scene).parent.glob("*.xml")))
-        raise ValueError(f"scene must be an XML file, got {str(scene)!r}, which does not exist{near}")
+        near = did_you_mean(
+            scene, (str(path) for s in (".xml", *SUFFIXES) for path in Path(scene).parent.glob(f"*{s}"))
+        )
+        raise ValueError(f"scene must be an XML or glTF file, got {str(scene)!r}, which does not exist{near}")
+    if is_gltf(scene) and parameters:
+        raise ValueError(f"parameters must be left out of a glTF file, got {', '.join(parameters)}")
     try:
-        if isinstance(scene, dict):
-            state = mi.parser.parse_dict(config, scene)
+        if isinstance(scene, dict) or is_gltf(scene):
+            state = mi.parser.parse_dict(config, scene if isinstance(scene, dict) else gltf_scene(Path(scene)))
         else:
             state = mi.parser.parse_file(config, str(scene), **parameters)
     except RuntimeError as error:

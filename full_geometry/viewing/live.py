@@ -17,6 +17,7 @@ from full_geometry.geometry.sensors import seeded
 from full_geometry.geometry.snapshot import differing
 from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.objects.objects import translucent_shapes
+from full_geometry.scenes.gltf import is_gltf
 from full_geometry.scenes.reference import check_sensor
 from full_geometry.scenes.reference_store import Reference, finite_pixels
 from full_geometry.scenes.scene_files import first_cause, open_scene, parsed
@@ -190,11 +191,14 @@ class LiveScene:
             The command that renders it.
 
         Raises:
-            ValueError: the name has a folder, does not end in .xml, or is the one of the scene that is looked at.
+            ValueError: the name has a folder, does not end in .xml, or is the one of the scene that is looked at; or
+                that is a glTF file.
         """
         path = self.folder / name
         if Path(name).name != name or path.suffix != ".xml" or path == self.file:
             raise ValueError(f"name must be of a new .xml file beside the scene, without folders, got {name!r}")
+        if is_gltf(self.source):
+            raise ValueError(f"scene must be an XML file or a dict to be saved, got {str(self.source)!r}")
         state, _ = parsed(self.source, self._parameters)
         if edits != Edits():
             change(state, edits, self._turned(edits))

@@ -18,6 +18,7 @@ from halfspace_sss.physics.medium import Medium
 
 if TYPE_CHECKING:
     import MaterialX as mx  # noqa: N813
+    import pygltflib
 
 CHANNELS = ("R", "G", "B")
 OPENPBR = {  # defaults of OpenPBR 1.1
@@ -89,7 +90,7 @@ def _of_materialx(path: Path, unit: float) -> Iterator[Material]:
                 if node.getInputValue("geometry_thin_walled"):
                     raise ValueError(f"geometry_thin_walled must be false, got true: {THIN}")
                 _warn_of(path, name, _not_taken(node))
-                values["specular_ior"] = _modulated(values["specular_ior"], values.pop("specular_weight"))
+                values["specular_ior"] = modulated(values["specular_ior"], values.pop("specular_weight"))
                 medium = Medium.from_openpbr(**values, mm_per_unit=unit)
                 yield Material(name, medium, CHANNELS, set="OpenPBR", source=str(path))
         except ValueError as error:
@@ -140,47 +141,64 @@ def _value(node: mx.Node, key: str, default: float | tuple[float, ...]) -> float
     return TO_REC709[space] @ np.array(value.asTuple())
 
 
-def _modulated(ior: float, weight: float) -> float:
+def modulated(ior: float, weight: float) -> float:
     """The index whose normal reflectance is `weight` times that of `ior`; OpenPBR 1.1, section dielectric base."""
     amplitude = abs(ior - 1) / (ior + 1)
     amplitude = math.copysign(min(math.sqrt(max(weight, 0.0)) * amplitude, 0.999), ior - 1)
     return (1 + amplitude) / (1 - amplitude)
 
 
-def _of_gltf(path: Path, unit: float) -> Iterator[Material]:
+def read_gltf(path: Path) -> pygltflib.GLTF2:
+    """A glTF file as pygltflib reads it; ValueError if it cannot, BackendError without that package."""
     try:
         import pygltflib
     except ImportError as error:
         raise BackendError(f'{path.suffix} needs pygltflib: pip install "halfspace-sss[import]"') from error
     try:
-        materials = pygltflib.GLTF2().load(str(path)).materials
+        return pygltflib.GLTF2().load(str(path))
     except Exception as error:  # pygltflib raises what json, struct and dataclasses_json raise
         raise ValueError(f"{path}: must be a glTF file, got {type(error).__name__}: {error}") from error
-    for k, material in enumerate(materials):
+
+
+def gltf_medium(parts: dict[str, dict], unit: float = 1000.0) -> Medium | None:
+    """The medium of a material of glTF by its extensions, None where it does not scatter.
+
+    Args:
+        parts: the extensions of the material, by name.
+        unit: length of a unit of the file, mm.
+
+    Raises:
+        ValueError: it has no thickness, or values that no medium has.
+    """
+    scatter, volume = parts.get("KHR_materials_volume_scatter"), parts.get("KHR_materials_volume", {})
+    if scatter is None:
+        return None
+    if volume.get("thicknessFactor", 0.0) == 0:
+        raise ValueError(f"thicknessFactor must be > 0, got 0: {THIN}")
+    color = scatter.get("multiscatterColor", scatter.get("multiscatterColorFactor", (0.0, 0.0, 0.0)))
+    distance = volume.get("attenuationDistance", math.inf) * unit / 1000
+    ior = parts.get("KHR_materials_ior", {}).get("ior", 1.5)
+    tint = volume.get("attenuationColor", (1.0, 1.0, 1.0))
+    return Medium.from_gltf(color, distance, tint, scatter.get("scatterAnisotropy", 0.0), ior)
+
+
+def _of_gltf(path: Path, unit: float) -> Iterator[Material]:
+    for k, material in enumerate(read_gltf(path).materials):
         parts, name = material.extensions or {}, material.name or f"{path.stem} {k}"
-        scatter, volume = parts.get("KHR_materials_volume_scatter"), parts.get("KHR_materials_volume", {})
-        if scatter is None:
-            continue
-        surface = material.pbrMetallicRoughness or pygltflib.PbrMetallicRoughness()
-        not_taken = _not_taken_of_gltf(material, surface, parts)
-        color = scatter.get("multiscatterColor", scatter.get("multiscatterColorFactor", (0.0, 0.0, 0.0)))
-        distance = volume.get("attenuationDistance", math.inf) * unit / 1000
-        tint = volume.get("attenuationColor", (1.0, 1.0, 1.0))
-        ior = parts.get("KHR_materials_ior", {}).get("ior", 1.5)
         try:
-            if volume.get("thicknessFactor", 0.0) == 0:
-                raise ValueError(f"thicknessFactor must be > 0, got 0: {THIN}")
-            _warn_of(path, name, not_taken)
-            medium = Medium.from_gltf(color, distance, tint, scatter.get("scatterAnisotropy", 0.0), ior)
-            yield Material(name, medium, CHANNELS, set="glTF", source=str(path))
+            medium = gltf_medium(parts, unit)
+            if medium is not None:
+                _warn_of(path, name, _not_taken_of_gltf(material, parts))
+                yield Material(name, medium, CHANNELS, set="glTF", source=str(path))
         except ValueError as error:
             raise ValueError(f"{path}: material {name!r}: {error}") from error
 
 
-def _not_taken_of_gltf(material: object, surface: object, parts: dict[str, object]) -> dict[str, object]:
+def _not_taken_of_gltf(material: pygltflib.Material, parts: dict[str, object]) -> dict[str, object]:
     """What changes the picture of a material of glTF and is in no medium, with its values."""
     none = {"baseColorFactor": [1.0] * 4, "metallicFactor": 0.0, "roughnessFactor": 0.0, "emissiveFactor": [0.0] * 3}
-    owners = [vars(surface), vars(material), *(parts.get(name, {}) for name in TAKEN_OF_GLTF)]
+    surface = material.pbrMetallicRoughness
+    owners = [vars(surface) if surface else {}, vars(material), *(parts.get(name, {}) for name in TAKEN_OF_GLTF)]
     written = {key: value for owner in owners for key, value in owner.items() if value is not None}
     factors = {key: written[key] for key in none if written.get(key, none[key]) != none[key]}
     textures = {key: "a texture" for key in written if key.endswith("Texture")}
