@@ -14,6 +14,7 @@ from urllib.parse import unquote
 
 import mitsuba as mi
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from halfspace_sss import materials
 from halfspace_sss.materials.imports import gltf_medium, modulated, read_gltf
@@ -86,6 +87,7 @@ class _File:
         self.path, self.doc, self.not_taken = path, read_gltf(path), []
         unit = {"type": "translucent_walk", "mm_per_unit": MM_PER_METRE}
         self.results: dict[str, Any] = {"type": "scene", "integrator": unit}
+        self.looks: dict[int, str] = {}  # names of surfaces by numbers of materials
         for name in sorted({*(self.doc.extensionsRequired or ()), *(self.doc.extensionsUsed or ())}):
             if name in (self.doc.extensionsRequired or ()) and name not in TAKEN or "compression" in name:
                 raise ValueError(f"{path}: must not need {name}: export it without")
@@ -98,11 +100,11 @@ class _File:
         maps = [path for path in map(self.path.with_suffix, (".hdr", ".exr")) if path.is_file()]
         if maps:
             turn = mi.ScalarTransform4f(SKY)
-            self.results["sky"] = {"type": "envmap", "filename": str(maps[0]), "to_world": turn}
+            self._put("sky", {"type": "envmap", "filename": str(maps[0]), "to_world": turn})
         parts = [part for part in self.results.values() if isinstance(part, dict)]
         if not any("emitter" in part or part["type"] in EMITTERS for part in parts):
             self.not_taken.append("no light, so that the sky is white")
-            self.results["sky"] = {"type": "constant"}
+            self._put("sky", {"type": "constant"})
         if not any(part["type"] == "perspective" for part in parts):
             raise ValueError(f"{self.path}: must have a camera, got none: export it with its cameras")
         return self.results
@@ -114,11 +116,13 @@ class _File:
         for child in node.children or ():
             yield from self._nodes(child, place)
 
-    def _put(self, name: str, part: dict[str, Any]) -> None:
+    def _put(self, name: str, part: dict[str, Any]) -> str:
         """Add a part of the scene under a name that Mitsuba takes and no other has."""
         name = (name or part["type"]).replace(".", "_")
         names = (name, *(f"{name}_{k}" for k in range(1, len(self.results) + 1)))
-        self.results[next(each for each in names if each not in self.results)] = part
+        name = next(each for each in names if each not in self.results)
+        self.results[name] = part
+        return name
 
     def _add(self, node: pygltflib.Node, place: np.ndarray) -> None:
         parts = node.extensions or {}
@@ -129,11 +133,10 @@ class _File:
             light = self.doc.extensions["KHR_lights_punctual"]["lights"][parts["KHR_lights_punctual"]["light"]]
             self._put(node.name, _light(light, place))
         for primitive in self.doc.meshes[node.mesh].primitives if node.mesh is not None else ():
-            triangles, colors = primitive.mode in (None, TRIANGLES), getattr(primitive.attributes, "COLOR_0", None)
-            wrong = {"points or lines": not triangles, "shape keys": primitive.targets, "colours of vertices": colors}
-            self.not_taken += [
-                f"{what} of {node.name}" for what, there in wrong.items() if there not in (None, False, [])
-            ]
+            triangles = primitive.mode in (None, TRIANGLES)
+            colored = getattr(primitive.attributes, "COLOR_0", None) is not None
+            wrong = {"points or lines": not triangles, "shape keys": primitive.targets, "colours of vertices": colored}
+            self.not_taken += [f"{what} of {node.name}" for what, there in wrong.items() if there]
             if triangles:
                 look = {} if primitive.material is None else self._look(primitive.material)
                 self._put(node.name, self._mesh(primitive, place) | look)
@@ -207,13 +210,14 @@ class _File:
 
     def _look(self, index: int) -> dict[str, Any]:
         """The surface of a material, by its name in the scene, and what it emits."""
-        material, key = self.doc.materials[index], f"material_{index}"
+        material = self.doc.materials[index]
         try:
-            if key not in self.results:
-                self.results[key] = self._masked(material, self._surface(material))
+            if index not in self.looks:
+                surface = self._masked(material, self._surface(material))
+                self.looks[index] = self._put(f"material {material.name or index}", surface)
         except ValueError as error:
             raise ValueError(f"{self.path}: material {material.name!r}: {error}") from error
-        parts, result = material.extensions or {}, {"bsdf": {"type": "ref", "id": key}}
+        parts, result = material.extensions or {}, {"bsdf": {"type": "ref", "id": self.looks[index]}}
         factor = np.array(material.emissiveFactor or (0.0, 0.0, 0.0))
         if factor.any():
             factor = factor * parts.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
@@ -253,7 +257,7 @@ class _File:
         self.not_taken += [f"{key} ({material.name})" for key in told]
         bump = material.normalTexture
         if bump is not None:
-            pixels = 0.5 + (self._pixels(bump.index)[..., :3] - 0.5) * [*(bump.scale or 1.0,) * 2, 1.0]
+            pixels = 0.5 + (self._pixels(bump.index, raw=True)[..., :3] - 0.5) * [*(bump.scale or 1.0,) * 2, 1.0]
             result = {"type": "normalmap", "normalmap": self._bitmap(bump, pixels, raw=True), "bsdf": result}
         return {"type": "twosided", "bsdf": result} if opaque else result
 
@@ -264,7 +268,7 @@ class _File:
             return surface
         texture, opacity = pbr.baseColorTexture, np.array((pbr.baseColorFactor or (1.0,) * 4)[3:])
         if texture is not None:
-            opacity = opacity * self._pixels(texture.index)[..., 3:]
+            opacity = opacity * self._pixels(texture.index, raw=True)[..., 3:]
         if material.alphaMode == "MASK":
             opacity = 1.0 * (opacity >= (0.5 if material.alphaCutoff is None else material.alphaCutoff))
         shown = opacity.item() if texture is None else self._bitmap(texture, opacity, raw=True)
@@ -274,26 +278,25 @@ class _File:
         """A colour, or a texture times a colour, linear."""
         if texture is None:
             return {"type": "rgb", "value": factor.tolist()}
-        pixels = self._pixels(texture.index)[..., :3]
-        linear = np.where(pixels <= 0.04045, pixels / 12.92, ((pixels + 0.055) / 1.055) ** 2.4)
-        return self._bitmap(texture, linear * factor, raw=False)
+        return self._bitmap(texture, self._pixels(texture.index, raw=False)[..., :3] * factor, raw=False)
 
     def _gray(self, texture: pygltflib.TextureInfo | None, channel: int, factor: float) -> dict[str, Any] | float:
         if texture is None or factor == 0:
             return float(factor)
-        return self._bitmap(texture, factor * self._pixels(texture.index)[..., channel : channel + 1], raw=True)
+        pixels = factor * self._pixels(texture.index, raw=True)[..., channel : channel + 1]
+        return self._bitmap(texture, pixels, raw=True)
 
-    def _pixels(self, index: int) -> np.ndarray:
-        """The values of an image as they are stored, in [0, 1], with four channels."""
-        image = self.doc.images[self.doc.textures[index].source]
-        data = self._view(image.bufferView) if image.uri is None else self._read(image.uri)
-        stream = mi.MemoryStream()
-        stream.write(data)
+    def _pixels(self, index: int, raw: bool) -> np.ndarray:
+        """The values of an image, with four channels: as they are stored, in [0, 1], or made linear from sRGB."""
+        source = self.doc.textures[index].source
+        if source is None:
+            raise ValueError("images must be PNG or JPEG, got another kind")
+        image, stream = self.doc.images[source], mi.MemoryStream()
+        stream.write(self._view(image.bufferView) if image.uri is None else self._read(image.uri))
         stream.seek(0)
         bitmap = mi.Bitmap(stream)
-        rgba = bitmap.convert(mi.Bitmap.PixelFormat.RGBA, bitmap.component_format(), bitmap.srgb_gamma())
-        pixels = np.array(rgba)
-        return pixels / np.iinfo(pixels.dtype).max
+        bitmap.set_srgb_gamma(not raw)
+        return np.array(bitmap.convert(mi.Bitmap.PixelFormat.RGBA, mi.Struct.Type.Float32, False))
 
     def _bitmap(self, texture: pygltflib.TextureInfo, pixels: np.ndarray, raw: bool) -> dict[str, Any]:
         """A texture of Mitsuba with the coordinates of one of glTF."""
@@ -347,14 +350,8 @@ def _local(node: pygltflib.Node) -> np.ndarray:
     """The matrix of a node in its parent."""
     if node.matrix is not None:
         return np.array(node.matrix, dtype=float).reshape(4, 4).T
-    x, y, z, w = node.rotation or (0.0, 0.0, 0.0, 1.0)
-    result = np.eye(4)
-    result[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    result[:3, :3] *= node.scale or (1.0, 1.0, 1.0)
+    result, turned = np.eye(4), Rotation.from_quat(node.rotation or (0.0, 0.0, 0.0, 1.0))
+    result[:3, :3] = turned.as_matrix() * (node.scale or (1.0, 1.0, 1.0))
     result[:3, 3] = node.translation or (0.0, 0.0, 0.0)
     return result
 
@@ -368,8 +365,8 @@ def _light(light: dict[str, Any], place: np.ndarray) -> dict[str, Any]:
         return {"type": "directional", "direction": (-place[:3, 2]).tolist(), "irradiance": strength}
     if light["type"] == "point":
         return {"type": "point", "position": place[:3, 3].tolist(), "intensity": strength}
-    ends = spot.get("outerConeAngle", math.pi / 4), spot.get("innerConeAngle", 0.0)
-    angles = dict(zip(("cutoff_angle", "beam_width"), map(math.degrees, ends)))
+    outer, inner = spot.get("outerConeAngle", math.pi / 4), spot.get("innerConeAngle", 0.0)
+    angles = {"cutoff_angle": math.degrees(outer), "beam_width": math.degrees(inner)}
     return {"type": "spot", "to_world": _turned(place), "intensity": strength, **angles}
 
 

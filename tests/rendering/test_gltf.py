@@ -56,7 +56,7 @@ def _glb(folder: Path, extras: dict | None = None, color: tuple = (0.8, 0.5, 0.3
     )  # fmt: skip
     for name, value in changes.pop("look", {}).items():
         setattr(material, name, value)
-    ball = gltf.Node(name="Ball.001", mesh=0, scale=[0.02, 0.02, 0.02], rotation=TURNED)
+    ball = gltf.Node(name="Ball.001", mesh=0, scale=[-0.02, 0.02, 0.02], rotation=TURNED)
     light = {"KHR_lights_punctual": {"light": 0}}
     doc = gltf.GLTF2(
         scene=0, scenes=[gltf.Scene(nodes=[0, 2, 3])], accessors=accessors, bufferViews=views, materials=[material],
@@ -84,14 +84,14 @@ def _glb(folder: Path, extras: dict | None = None, color: tuple = (0.8, 0.5, 0.3
 
 
 def _ply(path: Path) -> Path:
-    """The ball where it stands, with normals and uv, by which tangents are chosen."""
+    """The ball where it stands, mirrored and turned, with normals and uv, by which tangents are chosen."""
     points, faces = _ball()
-    turned = points[:, [2, 0, 1]].astype(float)
+    turned = (points * [-1.0, 1.0, 1.0])[:, [2, 0, 1]]
     normals = turned / np.linalg.norm(turned, axis=1, keepdims=True)
     rows = [" ".join(map(repr, row)) for row in np.hstack([0.02 * turned + [0, 0.1, 0], normals, _uv(points)]).tolist()]
     names = "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz", "u", "v"))
     head = f"ply\nformat ascii 1.0\nelement vertex 6\n{names}element face 8\nproperty list uchar int vertex_indices\n"
-    path.write_text("\n".join([head + "end_header", *rows, *(f"3 {a} {b} {c}" for a, b, c in faces)]) + "\n")
+    path.write_text("\n".join([head + "end_header", *rows, *(f"3 {a} {b} {c}" for c, b, a in faces)]) + "\n")
     return path
 
 
@@ -149,7 +149,7 @@ def test_media_are_those_of_custom_properties_and_extensions(of: str, tmp_path: 
 
 def test_textures_keep_their_place_and_are_multiplied(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match=r"ball.glb: not taken from it: roughness \(skin\)$"):
-        surface = gltf_scene(_glb(tmp_path, textured=True))["material_0"]
+        surface = gltf_scene(_glb(tmp_path, textured=True))["material skin"]
     texture, si = mi.load_dict(surface["reflectance"]), mi.SurfaceInteraction3f()
     si.uv = mi.Point2f([0.25, 0.75, 0.25, 0.75], [0.25, 0.25, 0.75, 0.75])  # v goes down in glTF
     colors = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]]) * [0.8, 0.5, 0.3]
@@ -162,7 +162,7 @@ def test_what_is_not_taken_is_listed_once(tmp_path: Path) -> None:
         "KHR_materials_specular": {"specularFactor": 0.5, "specularColorFactor": [1, 0, 0]},
     }
     with pytest.warns(UserWarning) as warned:
-        surface = gltf_scene(_glb(tmp_path, {}, parts=parts, animations=[gltf.Animation()]))["material_0"]["bsdf"]
+        surface = gltf_scene(_glb(tmp_path, {}, parts=parts, animations=[gltf.Animation()]))["material skin"]["bsdf"]
     (message,) = [str(w.message) for w in warned]
     wanted = "animations, KHR_materials_sheen (skin), specularColorFactor of KHR_materials_specular (skin)"
     assert message.endswith(f"ball.glb: not taken from it: {wanted}")
@@ -170,7 +170,10 @@ def test_what_is_not_taken_is_listed_once(tmp_path: Path) -> None:
     assert ((surface["eta"] - 1) / (surface["eta"] + 1)) ** 2 == pytest.approx(0.02)
 
 
-LIGHTS = {"directional": {"intensity": 1.0}, "spot": {"intensity": 683 * 0.04, "spot": {"outerConeAngle": 0.5}}}
+LIGHTS = {
+    "directional": {"intensity": 1.0},
+    "spot": {"intensity": 683 * 0.04, "spot": {"outerConeAngle": 0.5, "innerConeAngle": 0.5}},
+}
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -216,7 +219,7 @@ LOOKS = {  # what of a material, extensions: BSDFs from the outside
 def test_looks_become_surfaces_of_mitsuba(of: str, tmp_path: Path) -> None:
     look, parts, wanted = LOOKS[of]
     scene = gltf_scene(_glb(tmp_path, {}, parts=parts, look=look, textured=True))
-    surface, found = scene["material_0"], []
+    surface, found = scene["material skin"], []
     while surface:
         found.append(surface["type"])
         surface = surface.get("bsdf")
