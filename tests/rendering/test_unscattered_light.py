@@ -283,7 +283,7 @@ def test_precomputed_light_of_a_lamp_has_the_mean_of_sampled_light_where_scatter
         rough = {"type": "roughdielectric", "alpha": 0.3, "int_ior": 1.4, "ext_ior": 1.0}
         _compare({**FORWARD, "g": 0.8, "boundary": rough}, 0.012, **lamp)
     else:  # 5 mean free paths
-        _compare({**MEDIUM, "g": 0.9}, 0.02, _ball(2.0), spp=4096, **lamp)
+        _compare({**MEDIUM, "g": 0.9}, 0.02, _ball(2.0), spp=6144, **lamp)
 
 
 def test_light_of_a_window_has_a_fraction_of_the_noise_of_sampled_light() -> None:
