@@ -6,7 +6,8 @@
 
 `register` adds three plugins: the BSDF `translucent` (medium, model and scattering orders of an object) and the
 integrators `bssrdf` and `translucent_walk`. `train` learns S of one object, `errors` says how wrong a model of it is.
-`inverse` fits media to images; `trade` measures what each way of rendering costs and how wrong it is.
+`inverse` fits media to images; `trade` measures what each way of rendering costs and how wrong it is; `frames` renders
+animations.
 """
 
 from __future__ import annotations
@@ -22,14 +23,18 @@ if TYPE_CHECKING:
     from full_geometry.learning.training import train
     from full_geometry.plugins import register
     from full_geometry.transport.storing import load
+    from full_geometry.viewing.frames import frames
     from full_geometry.viewing.page import view
 
-__all__ = ["Recipe", "errors", "inverse", "load", "object_of", "register", "trade", "train", "transport_of", "view"]
+__all__ = [
+    "Recipe", "errors", "frames", "inverse", "load", "object_of", "register", "trade", "train", "transport_of", "view",
+]  # fmt: skip
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
         "Recipe": "learning.network_fitting",
         "errors": "learning.model_errors",
+        "frames": "viewing.frames",
         "inverse": "",
         "load": "transport.storing",
         "object_of": "learning.model_errors",

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from full_geometry.learning.online import Listeners
     from full_geometry.scenes.reference import Limits
     from full_geometry.scenes.reference_store import Picture, Reference
+    from full_geometry.viewing.frames import Rows
 
 SPP, ASKED = 64, 0.02  # samples of a pixel of what is named, relative error of what is not
 ENDINGS = ("png", "html", "denoised.exr", "denoised.png")  # of what is drawn
@@ -101,6 +102,9 @@ class ImageOptions:
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with the unfinished or finished render of the same settings.")
     ] = False
+    frames: Annotated[
+        Path | None, typer.Option(help="JSON or CSV file with a row of edits for each frame: NAME_MODEL_0001.exr.")
+    ] = None
 
 
 def render(
@@ -120,41 +124,75 @@ def render(
     """
     use_mitsuba(variant)
     from full_geometry.integrators.bssrdf import is_bssrdf
-    from full_geometry.scenes.cross_denoising import cross_denoised
-    from full_geometry.scenes.reference import chosen
-    from full_geometry.scenes.reference_store import Picture
-    from full_geometry.trade.denoising import Denoiser
-    from halfspace_sss.locks import one_writer
+    from full_geometry.scenes.reference import LARGEST_PASS, chosen
+    from full_geometry.viewing.frames import Animation, read_rows
     from halfspace_sss.provenance import check_folder
 
     until.limits()  # refuses what is out of range, before any work
-    drawers = _drawers(context, images.denoise)
+    drawers, rows = _drawers(context, images.denoise), read_rows(images.frames) if images.frames else None
     check_folder(out)
-    way = _way(scene, transport, until, shared.defined(define), (images.denoise, drawers is not None))
-    loaded, limits = way.scene, way.limits
+    way = _way(scene, transport, until, shared.defined(define), (images.denoise, drawers is not None), rows)
+    if rows:  # passes of one size, by which each frame has as many walks that correct its light
+        even = min(max((way.limits.spp or 32) // 8, 1), LARGEST_PASS)
+        way = replace(way, limits=replace(way.limits, spp_per_pass=2 ** (even.bit_length() - 1)))
+    loaded = way.scene
     sensors = _sensors(images.sensor, loaded)
     shared.say(*chosen(loaded, loaded.integrator()).get("choices", {}).values())
     if way.denoise and any(not loaded.sensors()[k].film().rfilter().is_box_filter() for k in sensors):
         shared.tell(
             "the film has no box filter: the denoiser keeps most of the noise that other filters spread over pixels"
         )
-    for k in sensors:
-        name = [scene.stem, transport.model or "scene", transport.light or "", f"sensor{k}" if k else ""]
-        file = out / f"{'_'.join(filter(None, name))}.exr"
-        with one_writer(file):
-            which = {"seed": images.seed, "sensor": k, **transport.training()}
-            denoise = Denoiser(loaded, k) if way.denoise else None
-            result = _rendered(loaded, file, limits, {**which, "denoise": denoise}, images.resume)
-            clean = cross_denoised(result, denoise) if denoise else None
-            told, error = _numbers(result), _error(result, limits.target_error or SMALL_ERROR)
-            off = (clean.image, {"error": clean.told}) if clean else None
-            files = _publish(Picture(file.stem, _colours(result.mean), told, error, off), file, drawers)
-            shared.say(f"{result.spp} samples a pixel in {result.seconds:.1f} s; {error}")
-            shared.say(*([clean.told] if clean else []))
-            shared.say_files(files)
-            if is_bssrdf(loaded.integrator()):
-                shared.say(*_off(loaded, result.mean, k, transport.model))
+    animation = Animation(loaded, rows) if rows else None
+    for frame in range(len(animation) if animation else 1):
+        if animation:
+            animation.show(frame)
+        for k in sensors:
+            name = [scene.stem, transport.model or "scene", transport.light or "", f"sensor{k}" if k else ""]
+            name += [f"{frame + 1:04}"] if animation else []
+            file = out / f"{'_'.join(filter(None, name))}.exr"
+            mean = _image(way, file, images, {"seed": images.seed, "sensor": k, **transport.training()}, drawers)
+            if is_bssrdf(loaded.integrator()) and not animation:
+                shared.say(*_off(loaded, mean, k, transport.model))
     shared.say(*(loaded.integrator().gathered if is_bssrdf(loaded.integrator()) else ()))
+
+
+def _image(
+    way: _Render, file: Path, images: ImageOptions, which: dict[str, Any], drawers: Drawers | None
+) -> np.ndarray | None:
+    """Render an image and write its files; None for a frame that is finished and gone on with."""
+    from full_geometry.scenes.cross_denoising import cross_denoised
+    from full_geometry.scenes.reference_store import Picture
+    from full_geometry.trade.denoising import Denoiser
+    from halfspace_sss.locks import one_writer
+
+    with one_writer(file):
+        if images.frames and images.resume and _is_finished(way, file, which):
+            shared.say(f"{file} is finished")
+            return None
+        denoise = Denoiser(way.scene, which["sensor"]) if way.denoise else None
+        result = _rendered(way.scene, file, way.limits, {**which, "denoise": denoise}, images.resume)
+        clean = cross_denoised(result, denoise) if denoise else None
+        told, error = _numbers(result), _error(result, way.limits.target_error or SMALL_ERROR)
+        off = (clean.image, {"error": clean.told}) if clean else None
+        picture = Picture(file.stem, _colours(result.mean), told, error, off)
+        drawn = drawers.render(picture) if drawers and (off or not images.frames) else {}
+        files = _publish(picture, file, {end: drawn[end] for end in drawn if not (images.frames and end == "html")})
+        shared.say(f"{result.spp} samples a pixel in {result.seconds:.1f} s; {error}")
+        shared.say(*([clean.told] if clean else []))
+        shared.say_files(files)
+    return result.mean
+
+
+def _is_finished(way: _Render, file: Path, which: dict[str, Any]) -> bool:
+    """Whether the file of a frame has the samples that are asked for; ValueError if it is of another render."""
+    from full_geometry.scenes import reference
+
+    if not file.exists():
+        return False
+    found = reference.load(file)
+    here = reference.about_render(way.scene, way.scene.integrator(), which["sensor"], which["seed"])
+    reference.check_same(found, file, found.about | here)  # weights and choices would have to be made anew
+    return way.limits.reached(found)
 
 
 def _off(scene: mi.Scene, image: np.ndarray, sensor: int, model: str | None) -> list[str]:
@@ -183,7 +221,7 @@ class _Render:
 
 def _way(
     scene: Path, transport: TransportOptions, until: UntilOptions, parameters: dict[str, str],
-    denoising: tuple[bool, bool],
+    denoising: tuple[bool, bool], rows: Rows | None,
 ) -> _Render:  # fmt: skip
     """The scene by what is named, or by the cheapest way that keeps the asked error: of all for the model "auto".
 
@@ -192,6 +230,7 @@ def _way(
 
     Args:
         denoising: whether it is asked for, and whether it can be.
+        rows: of an animation, which are refused here where they do not fit the scene.
     """
     import mitsuba as mi
 
@@ -201,6 +240,7 @@ def _way(
     from full_geometry.settings import AUTO, PATH_TRACED, Settings
     from full_geometry.trade.automatic import UNNAMED, decided, models_of, ways_of
     from full_geometry.trade.techniques import READY_FIRST, Technique
+    from full_geometry.viewing.frames import Animation
 
     # ---- what is asked for, and whether it is left to us
     denoise, error, ended = denoising[0], until.target_error, (until.spp, until.seconds) != (None, None)
@@ -208,6 +248,8 @@ def _way(
     if transport.model == AUTO and error:
         settings["tolerance"] = error
     loaded = open_scene(scene, transport.model, transport.orders, parameters, settings)
+    if rows:
+        Animation(loaded, rows)
     integrator, named = loaded.integrator(), (transport.model, transport.orders, transport.light)
     by_models = is_bssrdf(integrator) and set(models_of(loaded, integrator.settings)) == {AUTO}
     unnamed = named == (None, None, None) and (error or not ended) and names_nothing(scene, parameters)
@@ -327,12 +369,12 @@ class _Bars:
         self.bar.show(round(1000 * self.limits.share(reference)), 1000, f"{reference.spp} spp{error}")
 
 
-def _publish(picture: Picture, file: Path, drawers: Drawers | None) -> list[Path]:
+def _publish(picture: Picture, file: Path, drawn: dict[str, bytes]) -> list[Path]:
     """Put the finished files in the place of those of before, all of one render at any moment; their paths."""
     from halfspace_sss.provenance import replace_together, write_atomically
 
     part = _unfinished(file)
-    drawn = {"png": picture.png(), **(drawers.render(picture) if drawers else {})}
+    drawn = {"png": picture.png(), **drawn}
     for ending, data in drawn.items():
         write_atomically(part.with_suffix(f".{ending}"), data)
     phases = [ending for ending in PHASES if part.with_suffix(f".{ending}").exists()]

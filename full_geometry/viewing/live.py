@@ -169,7 +169,7 @@ class LiveScene:
             name_nodes(state)
 
         scene = open_scene(self.source, parameters=self._parameters, change=changed)
-        _put(scene, mi.traverse(scene), _of_light(scene))
+        put(scene, mi.traverse(scene), _of_light(scene))
         return scene
 
     def _turned(self, edits: Edits) -> np.ndarray:
@@ -224,14 +224,14 @@ class LiveScene:
             ValueError: the integrator refuses the scene.
         """
         started, integrator, guide = time.perf_counter(), self.integrator(way), None
-        coarse = _pass(self.scene, integrator, camera.sensor(COARSE), seed, 1)
+        coarse = image_of(self.scene, integrator, camera.sensor(COARSE), seed, 1)
         ready = time.perf_counter() - started
         rows, columns = (np.arange(n) * m // n for n, m in zip((camera.height, camera.width), coarse.shape))
         yield Shown(coarse[rows][:, columns, :3], 0, math.inf, ready, ready, ())
         sensor, mean, spp, told = camera.sensor(), None, 1, None
         while mean is None or mean.spp < MOST:
             begun = time.perf_counter()
-            image = _pass(self.scene, integrator, sensor, seeded(seed, mean.passes if mean else 0), spp)
+            image = image_of(self.scene, integrator, sensor, seeded(seed, mean.passes if mean else 0), spp)
             last = time.perf_counter() - begun
             mean = (mean or Reference.empty(image.shape, {})).add(image, spp, last)
             if told is None:
@@ -250,7 +250,8 @@ def _rows(matrix: object) -> tuple[tuple[float, ...], ...]:
     return tuple(map(tuple, np.array(matrix, dtype=float).reshape(4, 4).tolist()))
 
 
-def _pass(scene: mi.Scene, integrator: mi.Integrator, sensor: mi.Sensor, seed: int, spp: int) -> np.ndarray:
+def image_of(scene: mi.Scene, integrator: mi.Integrator, sensor: mi.Sensor, seed: int, spp: int) -> np.ndarray:
+    """An image of finite pixels; ValueError says why a scene is refused."""
     try:
         return finite_pixels("the image", integrator.render(scene, sensor, seed=seed, spp=spp))
     except RuntimeError as error:
@@ -262,11 +263,11 @@ def _brought(scene: mi.Scene, wanted: mi.Scene) -> bool:
     keys = differing(scene, wanted)
     if keys is None or any(".boundary." in key for key in keys):
         return False
-    _put(scene, mi.traverse(wanted), keys)
+    put(scene, mi.traverse(wanted), keys)
     return True
 
 
-def _put(scene: mi.Scene, values: Mapping[str, Any], keys: list[str]) -> None:
+def put(scene: mi.Scene, values: Mapping[str, Any], keys: list[str]) -> None:
     """Give parameters values that are data of kernels: literals would be code, compiled anew for each other value."""
     parameters = mi.traverse(scene)
     for key in keys:
