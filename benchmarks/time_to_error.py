@@ -18,13 +18,11 @@ import numpy as np
 import pandas
 
 from benchmarks.speeds import VOLUMES, LitObject
-from benchmarks.total_error import BLOCK, PRECOMPUTED
-from figures.computing.contenders import ready
+from benchmarks.total_error import BLOCK, PRECOMPUTED, image_of_pass, lit_scene
 from figures.computing.scans import prepare
 from figures.parts.part import Row
 from full_geometry.scenes.cross_denoising import Denoise, Halves
 from full_geometry.scenes.reference_store import Reference
-from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
 from full_geometry.trade.denoising import Denoiser
 
 FEWEST_PASSES = 8
@@ -62,25 +60,18 @@ def times_to_error(
     return pandas.DataFrame(rows)
 
 
-def _scene(case: LitObject, way: str, how: ErrorsWanted, folder: Path) -> mi.Scene | tuple[mi.Scene, ...]:
-    found = case.description(how.size, folder)
-    if way in VOLUMES:
-        return ready(way, found, case.key, case.medium)
-    return load_scene(found, PATH_TRACED, settings={"light": "precomputed", "layers": True})
-
-
 def _row(case: LitObject, way: str, how: ErrorsWanted, folder: Path) -> Row:
     """Passes of a fresh scene until both errors are reached; a scene before it compiles the kernels."""
-    compiled = _scene(case, way, how, folder)
+    compiled = lit_scene(case, way, how.size, folder)
     denoise = Denoiser(compiled if isinstance(compiled, mi.Scene) else compiled[0])
     for spp in (1, 2, 4, 8, 16, 32):
-        _image(compiled, spp, how.seed)
-    scene, started, seed = _scene(case, way, how, folder), time.process_time(), how.seed + 1
+        image_of_pass(compiled, spp, how.seed)
+    scene, started, seed = lit_scene(case, way, how.size, folder), time.process_time(), how.seed + 1
     found, last = None, 0
     while True:
         done = found.spp if found else 0
         spp = min(2 ** (max(done // SHARE, 1).bit_length() - 1), LARGEST_PASS)
-        image = _image(scene, spp, seed)
+        image = image_of_pass(scene, spp, seed)
         found = (found or Reference.empty(image.shape, {}, halves=True)).add(image, spp, 0.0)
         seconds, seed = time.process_time() - started, seed + 1
         if found.passes < FEWEST_PASSES or (found.spp < GROWTH * last and seconds < how.most):
@@ -96,13 +87,6 @@ def _row(case: LitObject, way: str, how: ErrorsWanted, folder: Path) -> Row:
         "object": case.name, "light": case.light, "way": way, "seconds": seconds if reached else np.inf,
         "spp": found.spp, **told, "seconds, raw": raw,
     }  # fmt: skip
-
-
-def _image(scene: mi.Scene | tuple[mi.Scene, ...], spp: int, seed: int) -> np.ndarray:
-    """One pass; three scenes have a channel each."""
-    scenes = scene if isinstance(scene, tuple) else (scene,)
-    parts = [np.array(mi.render(one, spp=spp, seed=100_000 * k + seed)) for k, one in enumerate(scenes)]
-    return parts[0] if len(parts) == 1 else np.stack([part[..., k] for k, part in enumerate(parts)], axis=2)
 
 
 def _errors(found: Reference, denoise: Denoise) -> dict[str, float]:

@@ -71,7 +71,8 @@ def total_errors(
     return pandas.DataFrame(rows)
 
 
-def _scene(case: LitObject, way: str, size: int, folder: Path) -> mi.Scene:
+def lit_scene(case: LitObject, way: str, size: int, folder: Path) -> mi.Scene | tuple[mi.Scene, ...]:
+    """The scene of a case for a way; that of `volpathmis` may be three, one for each channel."""
     found = case.description(size, folder)
     if way in VOLUMES:
         return ready(way, found, case.key, case.medium)
@@ -82,7 +83,7 @@ def _scene(case: LitObject, way: str, size: int, folder: Path) -> mi.Scene:
 
 
 def _measured(case: LitObject, how: TotalErrors, folder: Path) -> list[Row]:
-    scenes = {way: _scene(case, way, how.size, folder) for way in PASSING}
+    scenes = {way: lit_scene(case, way, how.size, folder) for way in PASSING}
     inside = cover(scenes[SAMPLED]) > 0
     denoise = Denoiser(scenes[SAMPLED])
     reference = _passes(scenes[SAMPLED], how.reference, REFERENCE_SPP, how.seed + 1)[0][..., :3]
@@ -99,7 +100,7 @@ def _measured(case: LitObject, how: TotalErrors, folder: Path) -> list[Row]:
             found[way, limit] = _averaged(images[:n], spp)
         costs[way] = _cost(images[..., :3], seconds, inside)
     for limit in how.seconds:
-        found[CORRECTED, limit] = _corrected(lambda: _scene(case, CORRECTED, how.size, folder), limit, how.seed)
+        found[CORRECTED, limit] = _corrected(lambda: lit_scene(case, CORRECTED, how.size, folder), limit, how.seed)
     best = min(costs[way] for way in VOLUMES)
 
     # ---- a row for each, raw and denoised
@@ -142,7 +143,7 @@ def _corrected(fresh: Callable[[], mi.Scene], limit: float, seed: int) -> Refere
     return _averaged(best[0][None], best[1])
 
 
-def _samples(scene: mi.Scene, seconds: float, seed: int) -> int:
+def _samples(scene: mi.Scene | tuple[mi.Scene, ...], seconds: float, seed: int) -> int:
     """Samples of a pixel, a power of two, that take at most so many CPU seconds, but not half as many; at least one."""
     spp = 1
     _passes(scene, 0.0, spp, seed)  # compiles
@@ -151,18 +152,24 @@ def _samples(scene: mi.Scene, seconds: float, seed: int) -> int:
     return spp
 
 
-def _passes(scene: mi.Scene, seconds: float, spp: int, seed: int) -> tuple[np.ndarray, list[float]]:
+def _passes(
+    scene: mi.Scene | tuple[mi.Scene, ...], seconds: float, spp: int, seed: int
+) -> tuple[np.ndarray, list[float]]:
     """Images of passes until these have taken so many CPU seconds, and what each took; at least one."""
     images: list[np.ndarray] = []
     took: list[float] = []
     while not took or sum(took) < seconds:
         started = time.process_time()
-        scenes = scene if isinstance(scene, tuple) else (scene,)
-        parts = [np.array(mi.render(one, spp=spp, seed=seed + 100_000 * k + len(took))) for k, one in enumerate(scenes)]
-        one_each = [part[..., k : k + 1] for k, part in enumerate(parts)]
-        images.append(np.concatenate(one_each, axis=2) if len(parts) > 1 else parts[0])
+        images.append(image_of_pass(scene, spp, seed + len(took)))
         took.append(time.process_time() - started)
     return np.array(images, dtype=np.float64), took
+
+
+def image_of_pass(scene: mi.Scene | tuple[mi.Scene, ...], spp: int, seed: int) -> np.ndarray:
+    """One image; three scenes have a channel each."""
+    scenes = scene if isinstance(scene, tuple) else (scene,)
+    parts = [np.array(mi.render(one, spp=spp, seed=seed + 100_000 * k)) for k, one in enumerate(scenes)]
+    return parts[0] if len(parts) == 1 else np.stack([part[..., k] for k, part in enumerate(parts)], axis=2)
 
 
 def _cost(images: np.ndarray, seconds: list[float], inside: np.ndarray) -> float:

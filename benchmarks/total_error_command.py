@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -13,42 +15,59 @@ from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.cli.shared import Bar, OutFolder, console, whole
 from halfspace_sss.provenance import check_folder, write_together
 
+if TYPE_CHECKING:
+    from benchmarks.speeds import LitObject
+
 __all__ = ["time_to_error_command", "total_error_command"]
 
 OBJECTS = ("hand of potato", "ribbon of cream", "bunny of skin1")
+Size = Annotated[int, typer.Option(help="Pixels of the square images.", parser=whole)]
+RenderSeed = Annotated[int, typer.Option(help="Seed of all renders.", parser=whole)]
+
+
+@dataclass(frozen=True)
+class LitOptions:
+    """Which objects, each in which lights."""
+
+    objects: Annotated[
+        list[str] | None, typer.Option("--object", help="As of `speeds`; repeat for more.", show_default="of the study")
+    ] = None
+    light: Annotated[
+        list[str] | None, typer.Option(help="As of `speeds`; repeat for more.", show_default="the first two there")
+    ] = None
+
+    def cases(self, objects: Sequence[str]) -> list[LitObject]:
+        """Each object, or each of `objects` where none is named, in each light; ValueError if there is no such one."""
+        from benchmarks.speeds import LIGHTS, OTHER_LIGHTS, LitObject
+
+        lights = tuple(self.light or LIGHTS)
+        for name in lights:
+            check_choice("light", name, (*LIGHTS, *OTHER_LIGHTS))
+        return [LitObject(name, each) for name in self.objects or objects for each in lights]
 
 
 def total_error_command(
-    objects: Annotated[
-        list[str] | None, typer.Option("--object", help="As of `speeds`; repeat for more.", show_default="three")
-    ] = None,
-    light: Annotated[
-        list[str] | None, typer.Option(help="As of `speeds`; repeat for more.", show_default="the first two there")
-    ] = None,
+    shown: LitOptions,
     seconds: Annotated[
         list[float] | None, typer.Option(help="CPU seconds of an image; repeat for more.", show_default="5, 20, 80")
     ] = None,
     reference: Annotated[float, typer.Option(help="CPU seconds of the reference.")] = 600.0,
-    size: Annotated[int, typer.Option(help="Pixels of the square images.", parser=whole)] = 128,
-    seed: Annotated[int, typer.Option(help="Seed of all renders.", parser=whole)] = 0,
+    size: Size = 128,
+    seed: RenderSeed = 0,
     out: OutFolder = Path("total_error"),
 ) -> None:
     """Measure total error over seconds of path tracing, raw and denoised, over long walks: all orders."""
     use_mitsuba("llvm_ad_rgb")
-    from benchmarks.speeds import LIGHTS, OTHER_LIGHTS, LitObject
     from benchmarks.total_error import TotalErrors, total_errors
     from benchmarks.total_error_plot import draw
     from halfspace_sss.comparison.style import saved
 
-    times, lights = tuple(sorted(seconds or TotalErrors.seconds)), tuple(light or LIGHTS)
-    for name in lights:
-        check_choice("light", name, (*LIGHTS, *OTHER_LIGHTS))
+    times, cases = tuple(sorted(seconds or TotalErrors.seconds)), shown.cases(OBJECTS)
     for value in (*times, reference):
         check_interval("seconds", value, 0.1, 1e6)
     check_count("size", size, 16)
     check_count("seed", seed, 0)
     check_folder(out)
-    cases = [LitObject(name, each) for name in objects or OBJECTS for each in lights]
     with Bar("total error") as bar:
         how = TotalErrors(times, reference, size, seed)
         table = total_errors(cases, how, out / "work", lambda what, k, n: bar.show(k, n, what))
@@ -73,34 +92,25 @@ TIMED = tuple(
 
 
 def time_to_error_command(
-    objects: Annotated[
-        list[str] | None, typer.Option("--object", help="As of `speeds`; repeat for more.", show_default="ten")
-    ] = None,
-    light: Annotated[
-        list[str] | None, typer.Option(help="As of `speeds`; repeat for more.", show_default="the first two there")
-    ] = None,
+    shown: LitOptions,
     pixels: Annotated[float, typer.Option(help="Relative error of pixels to reach.")] = 0.04,
     blocks: Annotated[float, typer.Option(help="Relative error of means over 8 x 8 pixels to reach.")] = 0.015,
     most: Annotated[float, typer.Option(help="CPU seconds after which a technique is given up.")] = 60.0,
-    size: Annotated[int, typer.Option(help="Pixels of the square images.", parser=whole)] = 512,
-    seed: Annotated[int, typer.Option(help="Seed of all renders.", parser=whole)] = 0,
+    size: Size = 512,
+    seed: RenderSeed = 0,
     out: OutFolder = Path("time_to_error"),
 ) -> None:
     """Measure CPU seconds to a total error of denoised path tracing, of walks and of volpathmis: all orders."""
     use_mitsuba("llvm_ad_rgb")
-    from benchmarks.speeds import LIGHTS, OTHER_LIGHTS, LitObject
     from benchmarks.time_to_error import ErrorsWanted, times_to_error
 
-    lights = tuple(light or LIGHTS)
-    for name in lights:
-        check_choice("light", name, (*LIGHTS, *OTHER_LIGHTS))
+    cases = shown.cases(TIMED)
     for name, value in (("pixels", pixels), ("blocks", blocks)):
         check_interval(name, value, 1e-4, 1.0)
     check_interval("most", most, 0.1, 1e6)
     check_count("size", size, 16)
     check_count("seed", seed, 0)
     check_folder(out)
-    cases = [LitObject(name, each) for name in objects or TIMED for each in lights]
     with Bar("time to error") as bar:
         how = ErrorsWanted(pixels, blocks, most, size, seed)
         table = times_to_error(cases, how, out / "work", lambda what, k, n: bar.show(k, n, what))

@@ -15,10 +15,8 @@ from full_geometry.trade.assessing import assess_for, corrected_chance
 from full_geometry.trade.results import Assessment, TechniqueTrade
 from full_geometry.trade.techniques import (
     CORRECTED,
-    DENOISED_WALKS,
-    PRECOMPUTED_WALKS,
     READY_FIRST,
-    WALKS,
+    WALKED,
     Effort,
     Job,
     Stage,
@@ -27,10 +25,7 @@ from full_geometry.trade.techniques import (
 )
 from halfspace_sss.provenance import provenance, write_atomically
 
-WAYS = (
-    *(way.name for way in (WALKS, PRECOMPUTED_WALKS, *DENOISED_WALKS)), "lambert",
-    f"{READY_FIRST}, {CORRECTED}",
-)  # fmt: skip
+WAYS = (*(way.name for way in WALKED), "lambert", f"{READY_FIRST}, {CORRECTED}")
 UNLIKELY = 0.1  # chance to keep the tolerance, below which corrected light has no long run
 FORMAT = "halfspace-sss trade check 8"
 

@@ -76,11 +76,11 @@ class Halves(NamedTuple):
     @property
     def share(self) -> float:
         """The share s of the noisy halves beside the denoised ones."""
-        e, V = max(float(np.sum(self._held())), 0.0), float((self.V_A + self.V_B).sum())
+        e, V = max(float(np.sum(self.held())), 0.0), float((self.V_A + self.V_B).sum())
         return e / (e + V) if e + V > 0 else 0.0
 
-    def _held(self) -> tuple[np.ndarray, np.ndarray]:
-        """Estimates of e_A² and e_B² of the pixels."""
+    def held(self) -> tuple[np.ndarray, np.ndarray]:
+        """Estimates of e_A² and e_B² of the pixels, (H, W, 3): each denoised half held to the other."""
         return (self.D_A - self.B) ** 2 - self.V_B, (self.D_B - self.A) ** 2 - self.V_A
 
     def mixed(self, s: float) -> tuple[np.ndarray, np.ndarray]:
@@ -89,7 +89,7 @@ class Halves(NamedTuple):
 
     def squared(self, s: float) -> tuple[np.ndarray, float]:
         """Estimates of e² of the pixels, (H, W, 3), and the part of their sum that is noise, not bias."""
-        (e_A, e_B), (P, Q), V = self._held(), self.mixed(s), self.V_A + self.V_B
+        (e_A, e_B), (P, Q), V = self.held(), self.mixed(s), self.V_A + self.V_B
         noise = 0.25 * ((1 - s) ** 2 * np.square(self.D_A - self.D_B).sum() + s**2 * V.sum())
         return 0.5 * ((1 - s) ** 2 * (e_A + e_B) + s**2 * V) - 0.25 * (P - Q) ** 2, float(noise)
 

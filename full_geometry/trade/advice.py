@@ -21,7 +21,7 @@ from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.settings import GATHERED_LIGHTS
 from full_geometry.trade.assessing import assess
 from full_geometry.trade.results import UNNAMED, Assessment, ObjectTrade, TechniqueTrade, html_table, samples_for
-from full_geometry.trade.techniques import CORRECTED, DENOISED_WALKS, LAMBERT, PRECOMPUTED_WALKS, Job, Technique
+from full_geometry.trade.techniques import CORRECTED, LAMBERT, WALKED, Job, Technique
 from halfspace_sss.noise_free import short
 
 if TYPE_CHECKING:
@@ -132,8 +132,7 @@ def advise(assessment: Assessment, job: Job) -> Advice:
     objects = tuple(_object(o, job) for o in assessment.objects)
     told = [o for o in objects if o.way is not None]
     models = (INTEGRATOR, *(f"{INTEGRATOR}, {light}" for light in GATHERED_LIGHTS))
-    walks = (PATH_TRACED, PRECOMPUTED_WALKS.name, *(each.name for each in DENOISED_WALKS))
-    best = {kind: [_best(o, kind) for o in told] for kind in (*models, *walks)}
+    best = {kind: [_best(o, kind) for o in told] for kind in (*models, *(each.name for each in WALKED))}
     times = {kind: sum(option.seconds for option in options) for kind, options in best.items()}
     integrator = min(times, key=lambda kind: times[kind])
     spp = max((option.spp for option in best[integrator]), default=0)

@@ -25,11 +25,10 @@ from full_geometry.trade.measuring import RunBudget, SceneSamples
 from full_geometry.trade.results import Assessment, ObjectTrade, TechniqueTrade, samples_for
 from full_geometry.trade.techniques import (
     CORRECTED,
-    DENOISED_WALKS,
     GATHERED,
-    PRECOMPUTED_WALKS,
     READY_FIRST,
     TRACED_SHARE,
+    WALKED,
     WALKS,
     Effort,
     Job,
@@ -50,8 +49,8 @@ LEAST_SHARE = 0.25  # of the time, for walks and what may win against them, howe
 LAST_SHARE = 0.1  # likewise, after light has been gathered
 KNOWN = 0.1  # standard error of a bias² over the squared tolerance that is enough
 CANDIDATES = (
-    PATH_TRACED, PRECOMPUTED_WALKS.name, *(each.name for each in DENOISED_WALKS), "lambert", READY_FIRST, "neural",
-    "full_geometry", "neural_shape", f"{READY_FIRST}, {CORRECTED}",
+    *(each.name for each in WALKED), "lambert", READY_FIRST, "neural", "full_geometry", "neural_shape",
+    f"{READY_FIRST}, {CORRECTED}",
     *(f"{name}, {GATHERED}" for name in (READY_FIRST, "neural", "full_geometry", "neural_shape")),
 )  # fmt: skip
 DEAR = ("neural_shape",)  # to run, which takes DEAR_SECONDS

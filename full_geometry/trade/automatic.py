@@ -29,10 +29,10 @@ from full_geometry.trade.assessing import CANDIDATES, assess_for
 from full_geometry.trade.results import Assessment, ObjectTrade, TechniqueTrade, samples_for
 from full_geometry.trade.techniques import (
     CORRECTED,
-    DENOISED_WALKS,
     LAMBERT,
     PRECOMPUTED_WALKS,
     READY_FIRST,
+    WALKED,
     WALKS,
     Effort,
     Job,
@@ -44,7 +44,6 @@ from halfspace_sss.provenance import provenance, write_atomically
 
 ENVIRONMENT_VARIABLE = "HALFSPACE_SSS_CHOICES"
 DEFAULT = "neural"
-WALKED = (WALKS, PRECOMPUTED_WALKS, *DENOISED_WALKS)
 UNNAMED = (*(way.name for way in WALKED), f"{READY_FIRST}, {CORRECTED}")  # where nothing names a model
 FORMAT = "halfspace-sss choice 4"
 

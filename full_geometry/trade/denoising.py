@@ -84,16 +84,21 @@ class Denoiser:
 
     Args:
         scene: of Mitsuba.
-        sensor: number of the sensor.
+        sensor: of Mitsuba, or its number.
+        integrator: that renders; None for the one of the scene.
+        spp: samples of albedo and normals.
 
     Raises:
         BackendError: the denoiser is not installed.
     """
 
-    def __init__(self, scene: mi.Scene, sensor: int = 0) -> None:
+    def __init__(
+        self, scene: mi.Scene, sensor: mi.Sensor | int = 0, integrator: mi.Integrator | None = None,
+        spp: int = GUIDE_SPP,
+    ) -> None:  # fmt: skip
         check_denoiser()
-        self._guides = guides(scene, sensor)
-        self._layered = bool(getattr(scene.integrator(), "layers", False))
+        self._guides = guides(scene, sensor, spp)
+        self._layered = bool(getattr(integrator or scene.integrator(), "layers", False))
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """The colours (H, W, 3) without noise; a layer of emission stays as it is: edges of lamps in mirrors are sharp.

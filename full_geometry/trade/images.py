@@ -15,6 +15,7 @@ import numpy as np
 
 from full_geometry.geometry.sensors import independent, seeded
 from full_geometry.objects.objects import translucent_shapes
+from full_geometry.scenes.cross_denoising import Halves
 from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.trade.denoising import GUIDE_SPP, GUIDES, denoised, guides_of
 from full_geometry.trade.image_differences import mean_flip
@@ -105,12 +106,9 @@ def _averaged(
 # --------------------------------------------------------------------------------------------------
 # Walks whose image is denoised: what is left of their noise and what the denoiser blurs, by tiles of the image.
 #
-# With A and B two independent halves of the passes, D denoised, the squared error of D(A) has
-#
-#     E [(D(A) - B)² - var B],
-#
-# whatever D does, and likewise with A and B exchanged. Tiles have pixels as large as those of the image: what a
-# denoiser blurs is as large as some pixels. Emission that the camera sees, at once or in a mirror, is not denoised.
+# Halves of the passes are denoised and held to each other, see `scenes.cross_denoising`. Tiles have pixels as large as
+# those of the image: what a denoiser blurs is as large as some pixels. Emission that the camera sees, at once or in a
+# mirror, is not denoised.
 
 
 TILE, MARGIN, TILES, MOST_TILES = 40, 4, 3, 8  # pixels; beside the margin errors of a whole image are the same
@@ -223,13 +221,11 @@ def _tile_errors(
     mask = mask & inner
     y, x = np.nonzero(mask)
     _, block = np.unique(y // BLOCK * mask.shape[1] + x // BLOCK, return_inverse=True)
+    means, noise = zip(*((half.mean(axis=0), half.var(axis=0, ddof=1) / len(half)) for half in halves))
     rows = []
-    for level in range(len(LEVELS)):
-        squares = np.zeros(mask.shape)
-        for D, other in zip(clean, reversed(halves)):
-            noise = other.var(axis=0, ddof=1) / len(other)
-            squares += 0.5 * ((D[level] - other.mean(axis=0)) ** 2 - noise).mean(axis=2)
-        rows.append(np.bincount(block, squares[mask]))
+    for D in zip(*clean):
+        e_A, e_B = Halves(*means, *noise, *D).held()
+        rows.append(np.bincount(block, 0.5 * (e_A + e_B).mean(axis=2)[mask]))
     return _TileErrors(np.array(rows), np.bincount(block))
 
 

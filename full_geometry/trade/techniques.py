@@ -94,13 +94,14 @@ class Technique:
 WALKS = Technique(PATH_TRACED)
 PRECOMPUTED_WALKS = Technique(PATH_TRACED, light=PRECOMPUTED)
 DENOISED_WALKS = tuple(replace(each, denoised=True) for each in (WALKS, PRECOMPUTED_WALKS))
+WALKED = (WALKS, PRECOMPUTED_WALKS, *DENOISED_WALKS)
 
 
 def techniques() -> list[Technique]:
     """All of them: path traced first, with light sampled and precomputed, denoised too, a diffuse surface, every model
     with light sampled and gathered, and the one that is ready first with light corrected."""
     names = [name for name in model_names() if name not in (AUTO, LAMBERT)]
-    results = [WALKS, PRECOMPUTED_WALKS, *DENOISED_WALKS, Technique(LAMBERT), *map(Technique, names)]
+    results = [*WALKED, Technique(LAMBERT), *map(Technique, names)]
     return [*results, *(Technique(name, light=GATHERED) for name in names), Technique(READY_FIRST, light=CORRECTED)]
 
 

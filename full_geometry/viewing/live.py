@@ -23,7 +23,7 @@ from full_geometry.scenes.reference_store import Reference, finite_pixels
 from full_geometry.scenes.scene_files import first_cause, open_scene, parsed
 from full_geometry.settings import OF_MITSUBA, PATH_TRACED, SHARED
 from full_geometry.surface.wrapped import surface_of
-from full_geometry.trade.denoising import denoised, guides
+from full_geometry.trade.denoising import Denoiser
 from full_geometry.viewing.edits import (
     Camera,
     Edits,
@@ -223,7 +223,7 @@ class LiveScene:
         Raises:
             ValueError: the integrator refuses the scene.
         """
-        started, integrator, guide = time.perf_counter(), self.integrator(way), None
+        started, integrator, denoise = time.perf_counter(), self.integrator(way), None
         coarse = image_of(self.scene, integrator, camera.sensor(COARSE), seed, 1)
         ready = time.perf_counter() - started
         rows, columns = (np.arange(n) * m // n for n, m in zip((camera.height, camera.width), coarse.shape))
@@ -238,9 +238,8 @@ class LiveScene:
                 told = tuple(integrator.gathered) if is_bssrdf(integrator) else ()
             shown = mean.mean[..., :3]
             if way.denoise:
-                guide = guide or guides(self.scene, sensor, GUIDE_SPP)
-                emission = mean.mean[..., -3:] if mean.mean.shape[2] > 3 else 0.0
-                shown = denoised(np.maximum(shown - emission, 0), *guide)[0] + emission
+                denoise = denoise or Denoiser(self.scene, sensor, integrator, GUIDE_SPP)
+                shown = denoise(mean.mean)
             yield Shown(shown, mean.spp, mean.relative_error, ready + mean.seconds, ready, told)
             spp = 2 * spp if last < BRIEF and SHARE * 2 * spp <= mean.spp else spp
 
