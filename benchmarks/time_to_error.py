@@ -90,7 +90,7 @@ def _row(case: LitObject, way: str, how: ErrorsWanted, folder: Path) -> Row:
 
 
 def _errors(found: Reference, denoise: Denoise) -> dict[str, float]:
-    """Relative errors of pixels and blocks, denoised and raw."""
+    """Relative errors of pixels and blocks, denoised and raw; infinite where the image is not above its noise."""
     halves, variance = Halves.of(found, denoise), found.variance[..., :3]
     mean, s, result = found.mean[..., :3], halves.share, {}
     for name, size in (("pixels", 1), ("blocks", BLOCK)):
@@ -98,8 +98,9 @@ def _errors(found: Reference, denoise: Denoise) -> dict[str, float]:
         means = Halves(A, B, V_A / size**2, V_B / size**2, D_A, D_B)
         squared, noise = means.squared(s)
         whole = np.square(_means(mean, size)).sum() - _means(variance, size).sum() / size**2
-        result[name] = float(np.sqrt(max(squared.sum(), noise) / whole))
-        result[f"raw {name}"] = float(np.sqrt(_means(variance, size).sum() / size**2 / whole))
+        # sum L², an estimate, falls to 0 and below where noise hides the image
+        for key, square in ((name, max(squared.sum(), noise)), (f"raw {name}", _means(variance, size).sum() / size**2)):
+            result[key] = float(np.sqrt(square / whole)) if whole > 0 else np.inf
     return result
 
 

@@ -41,6 +41,19 @@ def test_the_error_of_blocks_is_the_noise_of_pixels_over_their_width() -> None:
     assert errors["pixels"] == pytest.approx(errors["raw pixels"], rel=0.1)
 
 
+def test_an_image_below_its_noise_is_infinitely_far_off() -> None:
+    from benchmarks.time_to_error import _errors
+    from full_geometry.scenes.reference_store import Reference
+
+    rng, found = np.random.default_rng(4), Reference.empty((16, 16, 3), {}, halves=True)
+    for _ in range(8):
+        found = found.add(rng.standard_normal((16, 16, 3)), 1, 0.0)
+    assert (found.mean**2).sum() < found.variance.sum()
+    assert _errors(found, lambda image: image) == dict.fromkeys(
+        ("pixels", "raw pixels", "blocks", "raw blocks"), np.inf
+    )
+
+
 @pytest.mark.slow
 def test_precomputed_light_comes_nearer_to_the_reference_in_more_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
