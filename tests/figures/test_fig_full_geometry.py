@@ -96,9 +96,9 @@ def test_fig_9_has_a_column_of_the_full_geometry_with_the_time_of_its_training(s
 def test_fig_1_compares_objects_with_walks_where_they_cover_pixels(small: None, folder: Path) -> None:
     results, files = drawn("fig01", folder)
     table = rows(files["fig01.csv"])
-    assert list(table["object"]) == ["candle"] and table["FLIP"].between(0, 1).all()
+    assert list(table["object"]) == ["candle"] * 2 and table["FLIP"].between(0, 1).all()
     mask = results["candle, path_traced"].images["cover"] > 0.5
-    assert 0.02 < mask.mean() < 0.9 and results["candle, full_geometry"].images["image"][mask].mean() > 1e-3
+    assert 0.02 < mask.mean() < 0.9 and results["candle, full_geometry, corrected"].images["image"][mask].mean() > 1e-3
     assert files["fig01.png"].startswith(b"\x89PNG")
 
 
