@@ -82,19 +82,19 @@ def _class(variant: str) -> type:
             self._lit: list[TranslucentObject] | None = None  # while an image is rendered
             self._unconnected = dr.zeros(mi.Float64, 1)
 
-        def prepare(self, scene: mi.Scene, samples: int = 0) -> list[TranslucentObject]:
+        def prepare(self, scene: mi.Scene, samples: int = 1) -> list[TranslucentObject]:
             """The translucent objects of a scene, made ready once; ValueError if the scene cannot be rendered.
 
             Args:
                 scene: of Mitsuba.
-                samples: of an image, by which corrected light has its walks.
+                samples: of an image, by which corrected light has its walks; 0 for the light that is known.
             """
             check_parameters(scene)
             check_emitters(scene)
             with dr.suspend_grad():
                 return self._prepared(scene, samples)
 
-        def _prepared(self, scene: mi.Scene, samples: int = 0) -> list[TranslucentObject]:
+        def _prepared(self, scene: mi.Scene, samples: int = 1) -> list[TranslucentObject]:
             objects, light = self._objects.of(scene), self._objects.choices.light
             if light not in GATHERED_LIGHTS:
                 return objects
@@ -119,25 +119,36 @@ def _class(variant: str) -> type:
             """The image, in launches, between which an interrupt is heard."""
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             with interruptible(), undisturbed(), dr.suspend_grad():
-                # ---- the objects, and proposals for their entries by the light
                 samples = checked_samples(sensor, spp) * int(dr.prod(sampled_size(sensor.film())))
-                objects = self.prepare(scene, samples)
-                for obj in objects:
-                    if obj.spectral is not None:
-                        obj.spectral.check_covers(obj.geometry.name, sensor)
-                self._lit = self._by_light(scene, objects, sensor, spp)
-                self._unconnected = dr.zeros(mi.Float64, 1)
-
-                # ---- launches, each added to the film
-                try:
-                    sensor.film().prepare([])
-                    for launch in launches(sensor, spp):
-                        checkpoint()
-                        self._launch(scene, sensor, int(mi.UInt32(seed)[0]), launch)
-                        dr.sync_thread()
-                finally:
-                    self._lit = None
+                self._render(scene, self.prepare(scene, samples), sensor, seed, spp)
                 return sensor.film().develop() if develop else None
+
+        def preview(self, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int) -> mi.TensorXf:
+            """The image without new walks for a correction of light: a first look at a scene that has changed."""
+            with interruptible(), undisturbed(), dr.suspend_grad():
+                self._render(scene, self.prepare(scene, 0), sensor, seed, spp)
+                return sensor.film().develop()
+
+        def _render(
+            self, scene: mi.Scene, objects: list[TranslucentObject], sensor: mi.Sensor, seed: mi.UInt32 | int, spp: int
+        ) -> None:
+            """Fill the film of a sensor, in launches."""
+            # ---- proposals for entries of the objects by the light
+            for obj in objects:
+                if obj.spectral is not None:
+                    obj.spectral.check_covers(obj.geometry.name, sensor)
+            self._lit = self._by_light(scene, objects, sensor, spp)
+            self._unconnected = dr.zeros(mi.Float64, 1)
+
+            # ---- launches, each added to the film
+            try:
+                sensor.film().prepare([])
+                for launch in launches(sensor, spp):
+                    checkpoint()
+                    self._launch(scene, sensor, int(mi.UInt32(seed)[0]), launch)
+                    dr.sync_thread()
+            finally:
+                self._lit = None
 
         def _launch(self, scene: mi.Scene, sensor: mi.Sensor, seed: int, launch: Launch) -> None:
             """Add the samples of a launch to the film."""

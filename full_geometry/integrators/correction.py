@@ -126,7 +126,7 @@ class Corrections:
             scene: of Mitsuba.
             objects: with gathered light.
             settings: of the integrator.
-            samples: of the image, which set the number of walks.
+            samples: of the image, which set the number of walks; 0 leaves light as it is known.
 
         Raises:
             ValueError: the light of an object cannot be corrected.
@@ -137,6 +137,8 @@ class Corrections:
             _check(obj)
         if not same_objects(gathered, self._gathered):
             self._gathered, self._known = gathered, [None] * len(objects)
+        if not samples:
+            return objects if None in self._known else self._found
 
         # ---- walks that are missing, in two halves
         number = int(np.clip(samples // SAMPLES_PER_WALK, FEWEST, MOST))

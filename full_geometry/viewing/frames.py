@@ -57,7 +57,7 @@ def frames(
     animation = Animation(scene if isinstance(scene, mi.Scene) else open_scene(scene), rows)
     made, integrator = loaded(animation.scene, None, sensor)
     shown = map(animation.show, range(len(animation)))
-    return (image_of(made, integrator, made.sensors()[sensor], seed, spp) for _ in shown)
+    return (image_of(integrator.render, made, made.sensors()[sensor], seed, spp) for _ in shown)
 
 
 class Animation:

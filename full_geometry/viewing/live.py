@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -224,14 +224,16 @@ class LiveScene:
             ValueError: the integrator refuses the scene.
         """
         started, integrator, denoise = time.perf_counter(), self.integrator(way), None
-        coarse = image_of(self.scene, integrator, camera.sensor(COARSE), seed, 1)
+        # the walks of a correction come after the first image
+        draw = integrator.preview if is_bssrdf(integrator) else integrator.render
+        coarse = image_of(draw, self.scene, camera.sensor(COARSE), seed, 1)
         ready = time.perf_counter() - started
         rows, columns = (np.arange(n) * m // n for n, m in zip((camera.height, camera.width), coarse.shape))
         yield Shown(coarse[rows][:, columns, :3], 0, math.inf, ready, ready, ())
         sensor, mean, spp, told = camera.sensor(), None, 1, None
         while mean is None or mean.spp < MOST:
             begun = time.perf_counter()
-            image = image_of(self.scene, integrator, sensor, seeded(seed, mean.passes if mean else 0), spp)
+            image = image_of(integrator.render, self.scene, sensor, seeded(seed, mean.passes if mean else 0), spp)
             last = time.perf_counter() - begun
             mean = (mean or Reference.empty(image.shape, {})).add(image, spp, last)
             if told is None:
@@ -249,10 +251,10 @@ def _rows(matrix: object) -> tuple[tuple[float, ...], ...]:
     return tuple(map(tuple, np.array(matrix, dtype=float).reshape(4, 4).tolist()))
 
 
-def image_of(scene: mi.Scene, integrator: mi.Integrator, sensor: mi.Sensor, seed: int, spp: int) -> np.ndarray:
-    """An image of finite pixels; ValueError says why a scene is refused."""
+def image_of(draw: Callable, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int) -> np.ndarray:
+    """An image of finite pixels, by a method of an integrator; ValueError says why a scene is refused."""
     try:
-        return finite_pixels("the image", integrator.render(scene, sensor, seed=seed, spp=spp))
+        return finite_pixels("the image", draw(scene, sensor, seed=seed, spp=spp))
     except RuntimeError as error:
         raise ValueError(first_cause(error)) from error
 

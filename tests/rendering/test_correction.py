@@ -160,6 +160,8 @@ def test_light_is_corrected_anew_when_an_emitter_was_edited() -> None:
     parameters = mi.traverse(scene)
     parameters["lamp.emitter.radiance.value"] = 0.0
     parameters.update()
+    preview = np.array(scene.integrator().preview(scene, scene.sensors()[0], 0, 16))
+    assert scene.integrator().corrections.told() == [] and preview.mean() < 0.7 * before.mean()
     after = _image(scene, 16)
     lights = {"sky": {"type": "constant", "radiance": 0.3}}
     dark = {**_lamp(), **lights}
