@@ -39,6 +39,13 @@ def check_count(name: str, value: object, least: int) -> None:
         raise ValueError(f"{name} must be a whole number >= {least}, got {_plain(value)!r}")
 
 
+def as_count(name: str, value: object, least: int) -> int:
+    """As `check_count`, of a number that may be written 1e6."""
+    value = int(value) if isinstance(value, float) and value.is_integer() else value
+    check_count(name, value, least)
+    return int(value)
+
+
 def check_interval(name: str, value: object, low: float, high: float) -> None:
     if (
         isinstance(value, bool)

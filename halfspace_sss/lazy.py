@@ -24,7 +24,8 @@ def lazy_names(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], 
         return getattr(module, name) if homes[name] else module
 
     def names() -> list[str]:
-        return sorted({*vars(sys.modules[package]), *homes})
+        defined = vars(sys.modules[package])
+        return sorted({*(name for name in defined if name.startswith("__")), *defined.get("__all__", ()), *homes})
 
     return get, names
 

@@ -22,6 +22,7 @@ from halfspace_sss.provenance import JsonDict, check_folder, provenance, write_t
 
 if TYPE_CHECKING:
     import pandas
+    import xarray
     from matplotlib.figure import Figure
 
 TRACED = "path_traced"
@@ -168,6 +169,12 @@ class CurveSet:
             for c in self.curves
         ]  # fmt: skip
         return pandas.concat(parts, ignore_index=True)
+
+    def to_xarray(self) -> xarray.Dataset:
+        """S, S_at_r and standard_error over `theta_i_deg`, `series` and `r_mm`; NaN where a series has none."""
+        values = ["S", "S_at_r", "standard_error"]
+        keys = ["theta_i_deg", "series", "r_mm"]
+        return self.to_dataframe().set_index(keys)[values].to_xarray()
 
     def errors(self) -> pandas.DataFrame:
         """Error of every model per decade of r and over all, with reflectance and speed; one row each.

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from halfspace_sss.backend import array_types
-from halfspace_sss.checks import check_count, check_interval
+from halfspace_sss.checks import as_count, check_count, check_interval
 from halfspace_sss.comparison.curve_set import TRACED, Curve, CurveSet
 from halfspace_sss.comparison.model_truths import sampled_reflectance
 from halfspace_sss.interface.model import BSSRDF
@@ -140,7 +140,7 @@ def curves(
     angles = _checked_angles(theta_i_deg, theta_o_deg, delta_phi_deg, line_deg)
     check_count("n_r", n_r, 2)
     if n_paths not in (None, 0):
-        check_count("n_paths", n_paths, 256)
+        n_paths = as_count("n_paths", n_paths, 256)
     check_count("seed", seed, 0)
     array_types(backend)
     edges = np.geomspace(*_checked_range(r_min, r_max, medium), n_r + 1)

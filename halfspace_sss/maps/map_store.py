@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from halfspace_sss.backend import array_types
-from halfspace_sss.checks import check_count, check_interval
+from halfspace_sss.checks import as_count, check_count, check_interval
 from halfspace_sss.executors import completed
 from halfspace_sss.locks import one_writer
 from halfspace_sss.maps.grid import MapGrid, cell_edges, map_directions
@@ -160,6 +160,7 @@ def make_maps(
             has been written then. Or a unit of a store is damaged; nothing has been traced then.
     """
     grid = grid or MapGrid()
+    n_paths = n_paths if n_paths is None else as_count("n_paths", n_paths, 1024)
     _check(media, target_error, n_paths, seed)
     array_types(backend)
     paths = {name: path_of(folder) / f"{name}.zarr" for name in media}
@@ -237,8 +238,6 @@ def _check(media: object, target_error: object, n_paths: object, seed: object) -
         raise ValueError("target_error or n_paths must be given, got None for both")
     if target_error is not None:
         check_interval("target_error", target_error, 1e-4, 1.0)
-    if n_paths is not None:
-        check_count("n_paths", n_paths, 1024)
     check_count("seed", seed, 0)
 
 

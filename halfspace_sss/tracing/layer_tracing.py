@@ -17,7 +17,7 @@ from types import ModuleType
 import numpy as np
 
 from halfspace_sss.backend import array_types
-from halfspace_sss.checks import check_choice, check_cosine, check_count, check_interval
+from halfspace_sss.checks import as_count, check_choice, check_cosine, check_count, check_interval
 from halfspace_sss.physics.fresnel import F_r, mu_internal
 from halfspace_sss.physics.layers import Layers
 from halfspace_sss.physics.medium import sample_hg
@@ -127,7 +127,7 @@ def trace_layers(
     """
     if mu_i != "diffuse":
         mu_i = check_cosine("mu_i", mu_i)
-    check_count("n_paths", n_paths, 256)
+    n_paths = as_count("n_paths", n_paths, 256)
     check_count("seed", seed, 0)
     if relative_error is not None:
         check_interval("relative_error", relative_error, 1e-6, 1)

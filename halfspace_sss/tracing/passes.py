@@ -23,10 +23,48 @@ PATHS_PER_LANE, MAX_LANES = 64, 131072
 
 
 class Estimate(NamedTuple):
-    """A Monte Carlo number (or array) and its standard error."""
+    """A Monte Carlo number (or array) and its standard error.
+
+    Sums, differences, products and ratios carry the error to first order, as of independent estimates:
+
+        σ²(a ± b) = σ_a² + σ_b²,    σ²(a b) = (b σ_a)² + (a σ_b)²,    σ²(a / b) = (σ_a / b)² + (a σ_b / b²)².
+
+    Those of one trace, as its orders, are not independent: ask for the total instead.
+    """
 
     value: float | np.ndarray
     standard_error: float | np.ndarray
+
+    def __add__(self, other: Estimate | float | np.ndarray) -> Estimate:
+        b, error = _parts(other)
+        return Estimate(self.value + b, np.hypot(self.standard_error, error))
+
+    def __mul__(self, other: Estimate | float | np.ndarray) -> Estimate:
+        b, error = _parts(other)
+        return Estimate(self.value * b, np.hypot(b * self.standard_error, self.value * error))
+
+    def __neg__(self) -> Estimate:
+        return Estimate(-self.value, self.standard_error)
+
+    def __sub__(self, other: Estimate | float | np.ndarray) -> Estimate:
+        b, error = _parts(other)
+        return self + Estimate(-b, error)
+
+    def __rsub__(self, other: float | np.ndarray) -> Estimate:
+        return -self + other
+
+    def __truediv__(self, other: Estimate | float | np.ndarray) -> Estimate:
+        b, error = _parts(other)
+        return self * Estimate(1 / b, error / np.square(b))
+
+    def __rtruediv__(self, other: float | np.ndarray) -> Estimate:
+        return Estimate(other, 0.0) / self
+
+    __radd__, __rmul__, __array_ufunc__ = __add__, __mul__, None  # arrays of NumPy leave the operation to it
+
+
+def _parts(other: Estimate | float | np.ndarray) -> tuple[float | np.ndarray, float | np.ndarray]:
+    return other if isinstance(other, Estimate) else (other, 0.0)
 
 
 def estimate(samples: np.ndarray) -> Estimate:

@@ -7,21 +7,24 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import overload
+from typing import TYPE_CHECKING, overload
 
 import numpy as np
 
 from halfspace_sss.backend import array_types
-from halfspace_sss.checks import check_cosine, check_count, check_edges, check_finite, check_interval
+from halfspace_sss.checks import as_count, check_cosine, check_count, check_edges, check_finite, check_interval
 from halfspace_sss.physics.fresnel import F_t
 from halfspace_sss.physics.layers import Layers
 from halfspace_sss.physics.medium import Medium, check_scalar_medium, medium_of
 from halfspace_sss.progress import Progress
 from halfspace_sss.tracing.instrument import Instrument, Readings, Recorder, transformed
 from halfspace_sss.tracing.layer_tracing import LayerTrace, trace_layers
-from halfspace_sss.tracing.passes import Estimate, checked_radii, estimate, order_sum, walk_passes
+from halfspace_sss.tracing.passes import ORDERS, Estimate, checked_radii, estimate, order_sum, walk_passes
 from halfspace_sss.tracing.tallies import AngularTally, FluxTally, LineTally, MomentTally, RingTally
 from halfspace_sss.tracing.walk import Tally, walk
+
+if TYPE_CHECKING:
+    import xarray
 
 
 @dataclass(frozen=True, repr=False)
@@ -112,6 +115,30 @@ class Trace:
         flux = np.column_stack([flux, np.full(len(flux), beyond)])
         return estimate(transformed(flux, self._radii, frequencies))
 
+    def to_xarray(self) -> xarray.Dataset:
+        """All that was measured, by scattering order, each with its standard error as `NAME_error`.
+
+        `reflectance`, `mean_r2`, `mean_x` and `mean_path_length`, and with `radii` the `exitance` over `r_mm`, the
+        middle of each ring; pandas has it by `to_xarray().to_dataframe()`.
+        """
+        import xarray
+
+        measured = {
+            "reflectance": self.reflectance, "mean_r2": self.mean_r2, "mean_x": self.mean_x,
+            "mean_path_length": self.mean_path_length,
+        } | ({} if self._rings is None else {"exitance": self.exitance})  # fmt: skip
+        coords: dict[str, object] = {"order": list(ORDERS)}
+        if self._radii is not None:
+            coords["r_mm"] = 0.5 * (self._radii[1:] + self._radii[:-1])
+        data = {}
+        for name, ask in measured.items():
+            dims = ("order", "r_mm") if name == "exitance" else ("order",)
+            values = [ask(order) for order in ORDERS]
+            data[name] = dims, np.array([each.value for each in values])
+            data[f"{name}_error"] = dims, np.array([each.standard_error for each in values])
+        about = {"n_paths": self.n_paths, "seed": self.seed, "backend": self.backend, "medium": str(self.medium)}
+        return xarray.Dataset(data, coords, about)
+
 
 @overload
 def trace(medium: Medium, *arguments: object, **options: object) -> Trace: ...
@@ -168,7 +195,7 @@ def trace(
         )  # fmt: skip
     medium = medium_of(medium)
     check_scalar_medium(medium)
-    check_count("n_paths", n_paths, 256)
+    n_paths = as_count("n_paths", n_paths, 256)
     check_count("seed", seed, 0)
     if mu_i != "diffuse":
         mu_i = check_cosine("mu_i", mu_i)

@@ -55,6 +55,12 @@ def test_errors_are_weighted_by_the_area_of_cells() -> None:
     assert every["bias"] == pytest.approx((-2 * near + far) / (4 * near + far))
 
 
+def test_a_dataset_of_xarray_holds_the_curves() -> None:
+    data = _set([4, 1], [0.4, 0.1], [2, 2]).to_xarray().sel(theta_i_deg=0.0)
+    np.testing.assert_array_equal(data.S.sel(series=TRACED), [4, 1])
+    np.testing.assert_array_equal(data.standard_error.sel(series="m"), [0, 0])
+
+
 def test_errors_state_the_noise_of_the_tracer() -> None:
     errors = _set([4, 1], [0.4, 0.1], [4, 1]).errors().query("r_to_mm == 20 and r_from_mm == 1").set_index("series")
     assert errors.loc["m", "L1"] == 0

@@ -7,7 +7,7 @@ import pytest
 
 from halfspace_sss import Medium
 from halfspace_sss.tracing import walk
-from halfspace_sss.tracing.passes import MAX_LANES, PATHS_PER_LANE, estimate, launch_shape
+from halfspace_sss.tracing.passes import MAX_LANES, PATHS_PER_LANE, Estimate, estimate, launch_shape
 from halfspace_sss.tracing.tallies import BATCHES
 from halfspace_sss.tracing.tracer import trace
 
@@ -25,6 +25,18 @@ def test_an_estimate_is_the_mean_and_the_error_of_the_mean() -> None:
     columns = estimate(np.array([[1.0, 0.0], [2.0, 4.0], [6.0, 8.0]]))
     np.testing.assert_allclose(columns.value, [3.0, 4.0])
     np.testing.assert_allclose(columns.standard_error, np.sqrt([7 / 3, 16 / 3]))
+
+
+def test_arithmetic_of_estimates_carries_the_errors_of_independent_numbers() -> None:
+    rng = np.random.default_rng(4)
+    a, b = Estimate(3.0, 0.02), Estimate(np.array([2.0, 5.0]), np.array([0.03, 0.01]))
+    x = a.value + a.standard_error * rng.normal(size=(200_000, 1))
+    y = b.value + b.standard_error * rng.normal(size=(200_000, 2))
+    cases = ((a + b, x + y), (a - b, x - y), (a * b, x * y), (a / b, x / y), (2 * a - 1, 2 * x - 1), (1 / b, 1 / y),
+             (1 - np.array([1.0, 2.0]) * b, 1 - np.array([1.0, 2.0]) * y), (sum([a, b]), x + y))  # fmt: skip
+    for found, spread in cases:
+        np.testing.assert_allclose(found.value, spread.mean(axis=0), rtol=1e-3, atol=1e-3)
+        np.testing.assert_allclose(found.standard_error, spread.std(axis=0), rtol=0.01)
 
 
 @pytest.mark.parametrize("turns", [1, 7])
