@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from full_geometry.learning.online import Listeners
     from full_geometry.scenes.reference import Limits
     from full_geometry.scenes.reference_store import Picture, Reference
-    from full_geometry.viewing.frames import Rows
+    from full_geometry.viewing.frames import Animation, Rows
 
 SPP, ASKED = 64, 0.02  # samples of a pixel of what is named, relative error of what is not
 ENDINGS = ("png", "html", "denoised.exr", "denoised.png")  # of what is drawn
@@ -125,24 +125,23 @@ def render(
     use_mitsuba(variant)
     from full_geometry.integrators.bssrdf import is_bssrdf
     from full_geometry.scenes.reference import LARGEST_PASS, chosen
-    from full_geometry.viewing.frames import Animation, read_rows
+    from full_geometry.viewing.frames import read_rows
     from halfspace_sss.provenance import check_folder
 
     until.limits()  # refuses what is out of range, before any work
     drawers, rows = _drawers(context, images.denoise), read_rows(images.frames) if images.frames else None
     check_folder(out)
     way = _way(scene, transport, until, shared.defined(define), (images.denoise, drawers is not None), rows)
-    if rows:  # passes of one size, by which each frame has as many walks that correct its light
+    if way.animation:  # passes of one size, by which each frame has as many walks that correct its light
         even = min(max((way.limits.spp or 32) // 8, 1), LARGEST_PASS)
         way = replace(way, limits=replace(way.limits, spp_per_pass=2 ** (even.bit_length() - 1)))
-    loaded = way.scene
+    loaded, animation = way.scene, way.animation
     sensors = _sensors(images.sensor, loaded)
     shared.say(*chosen(loaded, loaded.integrator()).get("choices", {}).values())
     if way.denoise and any(not loaded.sensors()[k].film().rfilter().is_box_filter() for k in sensors):
         shared.tell(
             "the film has no box filter: the denoiser keeps most of the noise that other filters spread over pixels"
         )
-    animation = Animation(loaded, rows) if rows else None
     for frame in range(len(animation) if animation else 1):
         if animation:
             animation.show(frame)
@@ -212,11 +211,12 @@ def _off(scene: mi.Scene, image: np.ndarray, sensor: int, model: str | None) -> 
 
 @dataclass(frozen=True)
 class _Render:
-    """A scene as it is rendered, what ends that, and whether it is denoised."""
+    """A scene as it is rendered, what ends that, whether it is denoised, and its frames."""
 
     scene: mi.Scene
     limits: Limits
     denoise: bool
+    animation: Animation | None
 
 
 def _way(
@@ -248,14 +248,13 @@ def _way(
     if transport.model == AUTO and error:
         settings["tolerance"] = error
     loaded = open_scene(scene, transport.model, transport.orders, parameters, settings)
-    if rows:
-        Animation(loaded, rows)
+    animation = None if rows is None else Animation(loaded, rows)
     integrator, named = loaded.integrator(), (transport.model, transport.orders, transport.light)
     by_models = is_bssrdf(integrator) and set(models_of(loaded, integrator.settings)) == {AUTO}
     unnamed = named == (None, None, None) and (error or not ended) and names_nothing(scene, parameters)
     unnamed &= all(any(shape is each for each in loaded.shapes()) for shape in translucent_shapes(loaded))
     if mi.is_spectral or not (by_models or unnamed):
-        return _Render(loaded, until.limits(), denoise)
+        return _Render(loaded, until.limits(), denoise, animation)
 
     # ---- the way, and what ends it
     how = integrator.settings if by_models else Settings(mm_per_unit=integrator.mm_per_unit, tolerance=error or ASKED)
@@ -269,11 +268,12 @@ def _way(
     elif not ended:
         limits = replace(limits, spp=found.spp, target_error=None)
     if by_models and found.walks is None:  # the integrator finds again which models these are
-        return _Render(loaded, limits, denoise)
+        return _Render(loaded, limits, denoise, animation)
     denoise |= found.walks is not None and found.walks.denoised
     settings = {**transport.settings(denoise), "light": found.light}
     model = PATH_TRACED if found.walks else READY_FIRST
-    return _Render(open_scene(scene, model, transport.orders, parameters, settings), limits, denoise)
+    loaded = open_scene(scene, model, transport.orders, parameters, settings)
+    return _Render(loaded, limits, denoise, None if rows is None else Animation(loaded, rows))
 
 
 def _sensors(text: str, scene: mi.Scene) -> list[int]:

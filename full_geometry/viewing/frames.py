@@ -125,23 +125,23 @@ class Animation:
         return {name + VERTICES: p} | ({name + NORMALS: n} if n.size else {})
 
 
-def read_rows(file: str | Path) -> list[dict[str, ArrayLike]]:
+def read_rows(file: str | Path) -> Rows:
     """Rows of edits from a file: JSON, a list of objects; or CSV, a header of keys, numbers in a cell by spaces.
 
     Raises:
-        ValueError: the file cannot be read, a cell is empty, or a row has more cells than the header.
+        ValueError: the file cannot be read, or a row has more cells than the header.
     """
     try:
         text = Path(file).read_text(encoding="utf-8-sig")
         if Path(file).suffix.lower() == ".json":
-            return _complete(json.loads(text))
+            return json.loads(text) or []
     except (OSError, ValueError) as error:
         raise ValueError(f"frames must be a JSON or CSV file with rows, got {str(file)!r}: {error}") from error
     rows = list(csv.DictReader(text.splitlines(), restval="", restkey=""))
     for k, row in enumerate(rows):
         if "" in row:
             raise ValueError(f"frame {k + 1} must have as many cells as the header, which has names, got {row['']!r}")
-    return _complete([{key: re.findall(r"[^\s,;\[\]]+", cell) for key, cell in row.items()} for row in rows])
+    return [{key: re.findall(r"[^\s,;\[\]]+", cell) for key, cell in row.items()} for row in rows]
 
 
 def _complete(rows: Rows) -> list[dict[str, ArrayLike]]:

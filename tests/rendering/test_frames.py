@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +82,21 @@ def test_a_mesh_moves_from_where_it_stands_as_if_it_were_loaded_there(dim: dict)
         np.testing.assert_allclose(np.array(moved[key]), np.array(there[key]), atol=1e-6)
 
 
+def test_a_mesh_is_moved_once_for_a_frame_on_the_command_line(tmp_path: Path, monkeypatch: Any) -> None:
+    found = []
+    monkeypatch.setattr(cli, "drawers", lambda: None)
+    monkeypatch.setattr("full_geometry.cli.render._image", lambda way, *_: found.append(_height(way.scene)))
+    ball = '<shape id="ball" type="sphere"><float name="radius" value="5"/>'
+    assert ball in NAMED
+    rows = [{"ball.to_world": np.diag([1, 1, z, 1]).tolist()} for z in (2.0, 3.0)]
+    result = _run(tmp_path, json.dumps(rows), xml=NAMED.replace(ball, '<shape id="ball" type="cube">'), rows="a.json")
+    assert result.exit_code == 0 and found == [2.0, 3.0]
+
+
+def _height(scene: mi.Scene) -> float:
+    return float(np.array(mi.traverse(scene)["ball.vertex_positions"])[2::3].max())
+
+
 BAD = {
     "light.postion": ([[0, 0, 1]], "did you mean 'light.position'?"),
     "light.position": ([[0, 0]], "light.position of frame 1 must be 3 numbers, got 2"),
@@ -111,10 +127,10 @@ def test_wrong_rows_are_refused_before_any_image(dim: dict, monkeypatch: Any) ->
         assert message in str(error.value)
 
 
-def _run(folder: Path, csv: str, *more: str) -> Any:
-    (folder / "ball.xml").write_text(NAMED)
-    (folder / "rows.csv").write_text(csv)
-    files = [str(folder / "ball.xml"), "--frames", str(folder / "rows.csv"), "--out", str(folder / "out")]
+def _run(folder: Path, text: str, *more: str, xml: str = NAMED, rows: str = "rows.csv") -> Any:
+    (folder / "ball.xml").write_text(xml)
+    (folder / rows).write_text(text)
+    files = [str(folder / "ball.xml"), "--frames", str(folder / rows), "--out", str(folder / "out")]
     return CliRunner().invoke(cli.app, ["render", *files, "--spp", "2", *more])
 
 
