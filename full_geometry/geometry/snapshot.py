@@ -97,11 +97,13 @@ def _numbers(value: dr.ArrayBase | object) -> Iterator[np.ndarray]:
 # The identity of a scene: what it holds, whatever Mitsuba calls its objects, wherever they lie and in any order.
 
 
-# a name says nothing of the image but that of an attribute, an address nothing of the scene, and how many samples are
-# taken is told elsewhere
+# a name says nothing of the image but that of an attribute, an address nothing of the scene, how many samples are taken
+# is told elsewhere, and the area of a mesh is told once something has asked for it
 _MADE_UP = re.compile(r"0x[0-9a-fA-F]+|\bobject_\d+|\b_unnamed_\d+|__Root\w*")
 _LEFT_OUT = re.compile(
-    r'^\s*(name = "(?!vertex_|face_).*"|(sample_count|samples_per_wavefront|wavefront_size) = \d+),?$', re.MULTILINE
+    r'^\s*(name = "(?!vertex_|face_).*"|(sample_count|samples_per_wavefront|wavefront_size) = \d+),?$'
+    r"|^ *surface_area = .*\n",
+    re.MULTILINE,
 )
 
 

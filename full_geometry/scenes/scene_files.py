@@ -10,7 +10,7 @@ import re
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
 
@@ -279,7 +279,9 @@ def parsed(scene: dict | str | Path, parameters: Mapping[str, str]) -> tuple[Par
         raise ValueError(f"parameters must be left out of a glTF file, got {', '.join(parameters)}")
     try:
         if isinstance(scene, dict) or is_gltf(scene):
-            state = mi.parser.parse_dict(config, scene if isinstance(scene, dict) else gltf_scene(Path(scene)))
+            state = mi.parser.parse_dict(
+                config, _own_bitmaps(scene) if isinstance(scene, dict) else gltf_scene(Path(scene))
+            )
         else:
             state = mi.parser.parse_file(config, str(scene), **parameters)
     except RuntimeError as error:
@@ -339,9 +341,16 @@ def apart(function: Callable, parse: Callable) -> Callable:
     def found(scene: dict | str, *args: object, **more: object) -> mi.Scene | mi.Object:
         if not args and "optimize" not in more and _asks_apart(parse, scene, more):
             more["optimize"] = False
-        return function(scene, *args, **more)
+        return function(_own_bitmaps(scene), *args, **more)
 
     return found
+
+
+def _own_bitmaps(scene: Any) -> Any:
+    """A dict with copies of its bitmaps: Mitsuba writes spectra, and that bytes are linear, into those it is given."""
+    if isinstance(scene, dict):
+        return {key: _own_bitmaps(value) for key, value in scene.items()}
+    return mi.Bitmap(scene) if isinstance(scene, mi.Bitmap) else scene
 
 
 def _asks_apart(parse: Callable, scene: dict | str, more: Mapping[str, object]) -> bool:

@@ -10,6 +10,7 @@ import pytest
 from test_translucent_walk import WIDEST_Z_OF_RUNS, _runs, _scene, _z
 
 from full_geometry.geometry.points import SurfacePoint, plane_query
+from full_geometry.scenes.scene_files import open_scene
 from halfspace_sss import Medium, bssrdf, materials
 
 mi = pytest.importorskip("mitsuba")
@@ -197,3 +198,18 @@ def test_other_models_light_and_derivatives_refuse_spectra() -> None:
             mi.render(scene, integrator=mi.load_dict({"type": "bssrdf", **settings}), spp=1)
     with pytest.raises(ValueError, match="^derivatives must be of an RGB or mono variant, got llvm_ad_spectral"):
         scene.integrator().render_backward(scene, None, mi.TensorXf(0))
+
+
+def test_a_bitmap_stays_as_it_is_when_its_scene_is_loaded() -> None:
+    """Mitsuba writes the coefficients of spectra into the bitmap that it is given, and would take these for colours."""
+    image = mi.Bitmap(np.linspace(0.1, 0.9, 12, dtype=np.float32).reshape(2, 2, 3))
+    bytes_of = mi.Bitmap(np.full((2, 2, 3), 90, dtype=np.uint8))
+    textures = {"a": {"type": "bitmap", "bitmap": image}, "b": {"type": "bitmap", "bitmap": bytes_of, "raw": True}}
+    before = np.array(image)
+    scenes = [{"type": "scene", key: {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": texture}}, "o": {
+        "type": "sphere", "center": [3, 0, 0], "bsdf": {"type": "translucent", "albedo": 0.9, "sigma_t": 1.0}}}
+        for key, texture in textures.items()]  # fmt: skip
+    for scene in scenes:
+        mi.load_dict(scene)
+        open_scene(scene)
+    assert np.array_equal(np.array(image), before) and bytes_of.srgb_gamma()
