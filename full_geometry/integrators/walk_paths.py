@@ -10,7 +10,7 @@ index 1 are no vertices (`straight_light`).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -67,6 +67,31 @@ class LightRecord:
     precomputed: mi.Bool  # the ray's emission is in the unscattered light of the last event, or in the mirror image
     slopes: Score | tuple[()] = ()  # where derivatives are asked for, see `walk.scores`
     run: ForwardRun | tuple[()] = ()  # where precomputed light has met forward events
+
+
+class Behind(NamedTuple):
+    """What is behind a surface that a ray outside of objects has met, where something lies inside or overlaps.
+
+    Args:
+        member: whether the surface is a boundary to an object or in one.
+        bsdf: of the surface.
+        object: the number of the object behind it, or OUTSIDE.
+        within: see `Walk.within`.
+        unlit: whether emitters are met by chance alone: a medium, or boundaries that are hidden, are between.
+    """
+
+    member: mi.Bool
+    bsdf: mi.BSDFPtr
+    object: mi.Int32
+    within: mi.UInt32 | tuple[()]
+    unlit: mi.Bool
+
+    def entered(self, walk: Walk, through: mi.Bool, k: mi.Int32, enters: mi.Bool) -> tuple[Walk, mi.Int32, mi.Bool]:
+        """The walk, the object that it is in and whether it has entered that, where it goes through the surface."""
+        if len(walk.within):
+            walk = replace(walk, within=dr.select(through, self.within, walk.within))
+        inside = through & (self.object >= 0)
+        return walk, dr.select(self.member, self.object, k), dr.select(self.member, inside, enters)
 
 
 @dataclass
@@ -477,9 +502,34 @@ class PathTracer:
         # ---- the surface, unless the path is as deep as it may get
         depth = p.depth + 1
         alive = si.is_valid() & (depth < mi.UInt32(self.max_depth))
-        walk = replace(p.walk, alive=alive)
+        walk, skips = replace(p.walk, alive=alive), mi.Bool(False)
+        if len(walk.within):
+            walk, skips = self._skip(walk, si)
+            depth, alive = dr.select(skips, p.depth, depth), alive & ~skips
         p = replace(p, walk=walk, light=light, hit=p.hit | (first & si.is_valid()), depth=depth)
         return dr.if_stmt((p, si), alive, self._bounce, lambda p, si: p, label="bounce")
+
+    def _skip(self, walk: Walk, si: mi.SurfaceInteraction3f) -> tuple[Walk, mi.Bool]:
+        """The walk behind a boundary that a higher priority hides, and whether it has met one."""
+        media = self.visitor.media
+        si = media.face_outwards(si, media.index_of(si, si.is_valid()), walk.d)
+        met = media.inner.priorities.meet(si, walk.d, walk.within)
+        skips = walk.alive & met.passes
+        o, _ = media.depart(si, walk.d, mi.Bool(False))
+        return replace(walk, o=dr.select(skips, o, walk.o), within=dr.select(skips, met.within, walk.within)), skips
+
+    def _behind(self, walk: Walk, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, translucent: mi.Bool) -> Behind:
+        """Glass inside an object seen from within, which has that behind it, and boundaries of things that overlap."""
+        inner = self.visitor.media.inner
+        around = inner.around(si)
+        encloses = ~translucent & (around >= 0) & inner.displaces(si) & (dr.dot(walk.d, si.n) > 0)
+        if not len(walk.within):
+            return Behind(encloses, bsdf, around, (), encloses)
+        met = inner.priorities.meet(si, walk.d, walk.within)
+        pairs = ((met.bsdf, bsdf), (met.object, around), (met.within, walk.within))
+        return Behind(
+            encloses | met.member, *(dr.select(met.member, a, b) for a, b in pairs), encloses | (walk.within != 0)
+        )
 
     def _bounce(self, p: CameraPath, si: mi.SurfaceInteraction3f) -> CameraPath:
         """A surface met from outside: next-event estimation, BSDF sampling, Russian roulette, the way on or in."""
@@ -493,13 +543,13 @@ class PathTracer:
             bsdf = dr.select(translucent, media.boundary_pointer(near), bsdf)
             mute = translucent & ((p.depth == self.begins_at) | ~media.row("reflects", near))
         lit = ~mute
-        if media.inner is not None:
-            around = media.inner.around(si)
-            encloses = ~translucent & (around >= 0) & media.inner.displaces(si) & (dr.dot(walk.d, si.n) > 0)
-            lit &= ~encloses  # emitters on its other side are behind a medium
+        behind = None if media.inner is None else self._behind(walk, si, bsdf, translucent)
+        if behind is not None:
+            bsdf, lit = behind.bsdf, lit & ~behind.unlit
 
         # ---- next-event estimation: L += throughput f cos L_e / p_e  p_e / (p_e + p_f)
-        L = light.L + self.visitor.sampled_emitter(walk, si, bsdf, lit, translucent)
+        outer = translucent if behind is None else translucent | behind.member
+        L = light.L + self.visitor.sampled_emitter(walk, si, bsdf, lit, outer)
 
         # ---- emitters in the mirror of a smooth boundary: F L(mirrored direction)
         mirrors, L, p = self._mirror(L, p, si, bsdf, near, translucent & lit)
@@ -521,13 +571,13 @@ class PathTracer:
         u, channel = rng.next_float32(), walk.channel
         if len(weight) > 1:  # drawn once in a path, whose densities are counted from there
             channel = dr.select(p.depth == 1, below(len(weight), u), channel)
-        if media.inner is not None:  # from glass inside an object
-            returns = encloses & (dr.dot(d, si.n) > 0)
-            k, enters = dr.select(returns, around, k), enters | returns
+        if behind is not None:
+            through = behind.member & (dr.dot(d, si.n) * dr.dot(walk.d, si.n) > 0)
+            walk, k, enters = behind.entered(walk, through, k, enters)
         o, off = media.depart(si, d, enters)
         if media.carried:  # the medium of the exit, for the whole walk
             new = alive & enters
-            walk = replace(walk, medium=dr.select(new, media.fetch(near, si, new), walk.medium))
+            walk = replace(walk, medium=dr.select(new, media.fetch(dr.maximum(k, 0), si, new), walk.medium))
         walk = replace(walk, o=o, d=d, off=off, alive=alive, order=dr.select(enters, 0, walk.order), channel=channel,
                        object=dr.select(alive & enters, k, OUTSIDE), weight=weight, scale=scale)  # fmt: skip
 
@@ -540,9 +590,9 @@ class PathTracer:
         light = replace(light, L=L, previous=dr.select(again, light.previous, si.p), sighted=again,
                         pdf=dr.select(again, light.pdf, bs.pdf), delta=delta & ~again, scattered=scattered,
                         precomputed=mirrors & ~enters, run=light.run and light.run.ended())  # fmt: skip
-        if media.inner is not None:
+        if behind is not None:
             L = L + self.visitor.spread_inner_lights(walk, scattered & enters)
-            light = replace(light, delta=~again & (delta | enters | encloses), L=L)
+            light = replace(light, delta=~again & (delta | enters | through | behind.unlit), L=L)
         return replace(p, walk=walk, light=light)
 
     def _mirror(
@@ -583,6 +633,8 @@ def _begin(
     no, first = dr.full(mi.Bool, False, lanes), dr.full(mi.UInt32, 0, lanes)
     wavelengths = dr.gather(mi.Spectrum, rays.wavelengths, index, known) if mi.is_spectral else ()
     walk = start_walk(o, d, rng, media.unknown(lanes, wavelengths))
+    if media.overlaps:
+        walk.within = dr.full(mi.UInt32, 0, lanes)
     stay = Stay.none(lanes, media.textured) if scored else ()
     return CameraPath(index, walk, start_record(lanes, scored, forward), no, first, stay)
 

@@ -19,9 +19,10 @@ from full_geometry.surface.wrapped import surface_of
 
 STARTS = 64  # rays of each sensor that are looked at
 LOOKS = 512  # rays that look for parts of a shape in an object
+OVERLAP_LOOKS = 2**15  # that look for coplanar parts of shapes that overlap, of all pairs
 DEEP = 1e-3  # of the size of an object: what reaches less deep stands at its surface
 CLOSE = 4.0  # bounds of rounding: surfaces that are so close are one to rays
-MOST_TOUCHING = 4  # points of `LOOKS` on one surface that are on the other by chance, where both cross
+MOST_TOUCHING, SHARE_TOUCHING = 4, 5e-4  # points on one surface that are on the other by chance, where both cross
 REFRACTS = int(mi.BSDFFlags.DeltaTransmission) | int(mi.BSDFFlags.GlossyTransmission)
 PAIRS = 512  # in a launch
 DEPTHS = 32  # points of each of several pairs, whose depth is measured
@@ -69,7 +70,12 @@ def find_inclusions(scene: mi.Scene, objects: list[Geometry]) -> list[Inclusion]
             alone = alone or scene_of([shape], scene)
             if _tells(shape):
                 _check_apart(pairs, (shape, alone), holder)
-            for i, j, whole in _held(pairs, alone, holder):
+            held = _held(pairs, alone, holder)
+            partly = [ij[:2] for ij in held if not ij[2]]
+            if partly and _tells(shape):
+                rows = [k for k, ij in enumerate(zip(pairs.i.tolist(), pairs.j.tolist())) if ij in partly]
+                _check_apart(pairs.some(rows), (shape, alone), holder, max(OVERLAP_LOOKS // len(rows), LOOKS))
+            for i, j, whole in held:
                 for k in range(len(group.instances)) if i == EACH else (i,):
                     name = name_of(shape if group is None else group.instances[k])
                     number = int(holders.first[b]) + (k if i == EACH else j)
@@ -231,15 +237,15 @@ def _rounding_of(instance_table: InstanceTable, kind: int) -> np.ndarray:
     return instance_table.rounding[instance_table.numbers(kind)]
 
 
-def _check_apart(pairs: _Pairs, of: tuple[mi.Shape, mi.Scene], holder: Geometry) -> None:
-    """ValueError if a shape, in a scene of its own, and an object share a part of their surfaces."""
+def _check_apart(pairs: _Pairs, of: tuple[mi.Shape, mi.Scene], holder: Geometry, looks: int = LOOKS) -> None:
+    """ValueError if a shape, in a scene of its own, and an object share a part of their surfaces, by so many points."""
     shape, alone = of
     for start in range(0, len(pairs.i), PAIRS):
         part = pairs.some(slice(start, start + PAIRS))
         scales = (np.cbrt(np.abs(np.linalg.det(M[:, :3, :3]))) for M in (part.holder, part.thing))
         ways = np.linalg.inv(part.holder) @ part.thing, np.linalg.inv(part.thing) @ part.holder
         both = zip((shape, holder.shape), (holder.scene, alone), ways, scales)
-        shared = sum(_shares(*each, part.deep / scale) for *each, scale in both)
+        shared = sum(_shares(*each, part.deep / scale, looks) for *each, scale in both)
         if shared.any():
             raise ValueError(
                 f"surfaces must be apart by more than {part.deep[shared.argmax()]:.2g} scene units, outside or inside, "
@@ -247,9 +253,9 @@ def _check_apart(pairs: _Pairs, of: tuple[mi.Shape, mi.Scene], holder: Geometry)
             )
 
 
-def _shares(shape: mi.Shape, other: mi.Scene, into: np.ndarray, close: np.ndarray) -> np.ndarray:
+def _shares(shape: mi.Shape, other: mi.Scene, into: np.ndarray, close: np.ndarray, looks: int) -> np.ndarray:
     """Whether a part of the surface of a shape lies on that of a scene, whose frame each of the matrices leads into."""
-    u = np.random.default_rng(19).random((2, LOOKS)).astype(np.float32)
+    u = np.random.default_rng(19).random((2, looks)).astype(np.float32)
     try:
         drawn = shape.sample_position(0.0, mi.Point2f(u))
     except (RuntimeError, NotImplementedError):  # of shapes that cannot be drawn from
@@ -262,7 +268,7 @@ def _shares(shape: mi.Shape, other: mi.Scene, into: np.ndarray, close: np.ndarra
     ray.maxt = mi.Float(np.repeat(2 * close, p.shape[2]))
     si = other.ray_intersect(ray, mi.RayFlags.Minimal, False)
     on = np.array(si.is_valid() & (dr.abs(dr.dot(si.n, ray.d)) > 0.99))
-    return on.reshape(len(into), -1).sum(axis=1) > MOST_TOUCHING
+    return on.reshape(len(into), -1).sum(axis=1) > max(MOST_TOUCHING, SHARE_TOUCHING * looks)
 
 
 def place_of(emitter: mi.Emitter) -> np.ndarray | None:

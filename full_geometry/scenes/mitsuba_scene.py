@@ -91,6 +91,8 @@ def medium(spec: MediumSpec, mm_per_unit: float) -> mi.Medium:
             f"orders must be 'total', with reflection, for Mitsuba's media, got {spec.orders!r} and "
             f"reflection {spec.reflection} for {spec.label}"
         )
+    if spec.priority is not None:
+        raise ValueError(f"media must be without priority for Mitsuba's media, got {spec.priority:g} of {spec.label}")
     m = spec.medium
     if np.ptp(m.g) > 0:
         raise ValueError(f"g must be the same in all channels for Mitsuba's media, got {m.g} for {spec.label}")

@@ -33,6 +33,8 @@ Parameters, all optional but the medium:
     a BSDF inside: the boundary, a `dielectric` or `roughdielectric` with int_ior / ext_ior equal to the eta of the
         medium; by default smooth. A rough one is traced by `translucent_walk` alone.
     reflection: whether the boundary reflects light, by default true.
+    priority: where objects or glass overlap, space belongs to the larger one, by default 0. An object that has one, or
+        lies inside another in part, has its eta over the index of what is around all of them.
 
 `mitsuba.traverse` shows `albedo`, `sigma_t` (1/mm) and `g` of each channel, textures where they stand for these, and
 the parameters of the boundary.
@@ -45,6 +47,7 @@ from __future__ import annotations
 
 import functools
 import math
+import re
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -55,6 +58,7 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.geometry.points import mirrored, opaque
+from full_geometry.geometry.snapshot import held
 from full_geometry.settings import ORDERS, check_parameters, variant_channels
 from full_geometry.surface.spectral import EVERYWHERE, MediumByWavelength, read_file, spectral_medium
 from full_geometry.surface.textured import TexturedMedium, constant_texture, textured_medium
@@ -169,6 +173,26 @@ def boundary_of(surfaces: list[mi.BSDF], eta: float) -> mi.BSDF:
         if kind != "SmoothDielectric" or mi.traverse(boundary).keys() != {"eta"}:  # rough, or tinted
             return boundary
     return smooth_boundary(eta)
+
+
+def with_index(boundary: mi.BSDF, eta: float) -> mi.BSDF:
+    """A boundary of the same roughness and another relative index, inside over outside; itself if it has that.
+
+    Raises:
+        ValueError: the boundary is tinted.
+    """
+    if is_smooth_boundary(boundary):
+        return boundary if abs(float(np.max(np.array(boundary.eta))) - eta) < 1e-6 * eta else smooth_boundary(eta)
+    parameters = mi.traverse(boundary)
+    if abs(float(np.max(np.array(parameters["eta"]))) - eta) < 1e-6 * eta:
+        return boundary
+    alpha = {key: value for key, value in held(boundary) if key != "eta"}
+    if not alpha.keys() <= {"alpha", "alpha_u", "alpha_v"}:
+        raise ValueError(f"the boundary of what overlaps must be without tints, got {', '.join(sorted(alpha))}")
+    if abs(eta - 1) < 1e-6:  # which no roughdielectric has
+        return smooth_boundary(1.0)
+    kind = re.search(r"distribution = (\w+)", str(boundary))[1]
+    return mi.load_dict({"type": "roughdielectric", "distribution": kind, "int_ior": eta, "ext_ior": 1.0, **alpha})
 
 
 def check_eta(boundary: mi.BSDF, eta: float) -> None:
@@ -423,7 +447,7 @@ def _boundaries(props: mi.Properties) -> list[tuple[str, mi.BSDF]]:
 
 PARAMETERS = (
     "material", "sigma_s", "sigma_a", "sigma_t", "albedo", "scale", "reflectance", "mfp", "g", "eta", "model", "orders",
-    "channel", "dilution", "reflection", "spectra", "unit",
+    "channel", "dilution", "reflection", "spectra", "unit", "priority",
 )  # fmt: skip
 
 
@@ -440,6 +464,7 @@ class MediumSpec:
         varying: how the medium varies in space, a `VaryingMedium`, or None. `medium` then has the means of the grids.
         textured: how it varies over the surface, a `TexturedMedium`, or None; `medium` then has the means of texels.
         spectral: by wavelength, a `MediumByWavelength`, under spectral variants; `medium` then is at four wavelengths.
+        priority: where objects overlap, see `walk.priorities`; None where it is not given.
     """
 
     label: str
@@ -450,6 +475,7 @@ class MediumSpec:
     varying: VaryingMedium | None = None
     textured: TexturedMedium | None = None
     spectral: MediumByWavelength | None = None
+    priority: float | None = None
 
     @property
     def is_homogeneous(self) -> bool:
@@ -514,9 +540,12 @@ def read_medium_spec(props: mi.Properties) -> MediumSpec:
         (label, medium, varying, textured), spectral = _medium(props), None
     model, orders = props.get("model", "neural"), props.get("orders", "total")
     check_choice("orders", orders, ORDERS)
+    priority = float(props["priority"]) if "priority" in props else None
+    if not math.isfinite(priority or 0.0):
+        raise ValueError(f"priority must be finite, got {priority!r}")
     return MediumSpec(
         label=label, medium=medium, model=model, orders=orders, reflection=bool(props.get("reflection", True)),
-        varying=varying, textured=textured, spectral=spectral,
+        varying=varying, textured=textured, spectral=spectral, priority=priority,
     )  # fmt: skip
 
 

@@ -29,6 +29,7 @@ from full_geometry.surface.translucent import MediumSpec, is_rough, is_smooth_bo
 from full_geometry.surface.varying import VaryingMedium, eval_volume
 from full_geometry.surface.wrapped import Wrapping, surface_of, wrapping_of
 from full_geometry.walk.emission import unmasked_surface
+from full_geometry.walk.priorities import Priorities
 from halfspace_sss.physics.medium import Medium
 
 # ---- Shapes, media and lights inside objects ------------------------------------------------------------------------
@@ -52,19 +53,22 @@ class InclusionTable:
         tables: by these numbers, the number of the object `around` a shape or -1, and whether it `displaces` that; by
             the number of an object, whether it stands `alone`, neither in another nor around anything.
         lights: the delta lights in the medium of an object, and its number.
+        priorities: of what overlaps; None where nothing does.
     """
 
     scene: mi.Scene
     instance_table: InstanceTable
     tables: dict[str, mi.Int32 | mi.Bool]
     lights: list[tuple[mi.Emitter, int]]
+    priorities: Priorities | None = None
 
     @classmethod
     def of(cls, scene: mi.Scene, objects: list[Geometry]) -> InclusionTable | None:
         """What lies inside; None if nothing does.
 
         Raises:
-            ValueError: something that refracts lies partly inside or is not closed, or objects count some orders only.
+            ValueError: something inside that refracts is not closed, objects count some orders only, or as of
+                `Priorities.of`.
         """
         result = find_inclusions(scene, objects)
         if not result:
@@ -73,11 +77,12 @@ class InclusionTable:
         groups = shown_groups(scene)
         own = InstanceTable.of([obj.shape for obj in objects], groups)
         _check(result, objects, own)
-        glass = [analyse_shape(thing, scene) for thing in _shapes(result) if _displaces(thing)]
-        for piece in glass:
-            if not piece.closed:
-                raise ValueError(f"refracting inclusions of an object must be closed, got the shape {piece.name}")
-        if glass:
+        glass: list[Geometry] = []
+        while more := [s for s in _shapes(result) if _displaces(s) and not any(s is piece.shape for piece in glass)]:
+            glass += [analyse_shape(shape, scene) for shape in more]
+            for piece in glass:
+                if not piece.closed:
+                    raise ValueError(f"refracting inclusions of an object must be closed, got the shape {piece.name}")
             result = find_inclusions(scene, [*objects, *glass])
 
         # ---- number shapes inside after the objects, each at all its places
@@ -88,9 +93,10 @@ class InclusionTable:
         first = {id(shape): int(number) for shape, number in zip(instance_table.shapes, instance_table.first)}
 
         # ---- what is around each: the smallest holder comes last and stays
-        around, lights = np.full(len(instance_table), -1), {}
+        around, lights, result = np.full(len(instance_table), -1), {}, _largest_first(result, holders)
+        priorities = Priorities.of(scene, result, holders, len(own), groups)
         holding, held = np.zeros(len(own), dtype=bool), np.zeros(len(instance_table), dtype=bool)
-        for inclusion in _largest_first(result, holders):
+        for inclusion in result:
             number = inclusion.object if inclusion.object < len(own) else -1
             if isinstance(inclusion.node, mi.Emitter):
                 lights[id(inclusion.node)] = inclusion.node, number
@@ -102,11 +108,13 @@ class InclusionTable:
         # ---- tables of the kernel
         displaces = [_displaces(shape) for shape in instance_table.shapes]
         alone = ~holding & ~held[: len(own)]
+        if priorities is not None:
+            alone[[k for k in priorities.members() if k < len(own)]] = False
         tables = {"around": mi.Int32(around.tolist()), "alone": mi.Bool(alone.tolist())}
         tables["displaces"] = mi.Bool([displaces[kind] for kind in instance_table.kind])
         dr.make_opaque(tables)
         lights = [(light, k) for light, k in lights.values() if is_delta(light) and k >= 0]
-        return cls(instance_table.scene(scene), instance_table, tables, lights)
+        return cls(instance_table.scene(scene), instance_table, tables, lights, priorities)
 
     def around(self, si: mi.SurfaceInteraction3f) -> mi.Int32:
         """The number of the object around what a ray has met, or -1."""
@@ -137,7 +145,7 @@ def _largest_first(result: list[Inclusion], holders: InstanceTable) -> list[Incl
 
 
 def _check(result: list[Inclusion], objects: list[Geometry], instance_table: InstanceTable) -> None:
-    # what refracts is wholly inside or outside, in objects without textures whose orders all count
+    # what refracts is in objects without textures whose orders all count
     for inclusion in result:
         holder = objects[instance_table.kind[inclusion.object]]
         surfaces = [surface_of(holder.shape)]
@@ -146,11 +154,6 @@ def _check(result: list[Inclusion], objects: list[Geometry], instance_table: Ins
             if surfaces[0].spec.textured is not None and (translucent or _displaces(inclusion.node)):
                 raise ValueError(
                     f"an object with textures must hold nothing that refracts, got {inclusion.name} in {holder.name}"
-                )
-            if not inclusion.whole and (translucent or _displaces(inclusion.node)):
-                raise ValueError(
-                    f"refracting shapes must lie inside an object or outside, got {inclusion.name} partly inside "
-                    f"object {holder.name}"
                 )
             surfaces += [surface_of(inclusion.node)] if translucent else []
         for surface in surfaces:
@@ -434,6 +437,11 @@ class WalkMedia:
     def any_refracts(self) -> bool:
         """Whether a boundary is smooth and not straight."""
         return any(not is_rough(b) and not straight for b, straight in zip(self.boundaries, self._straight()))
+
+    @property
+    def overlaps(self) -> bool:
+        """Whether walks have to know what is around them, see `walk.priorities`."""
+        return self.inner is not None and self.inner.priorities is not None
 
     def connects(self, k: mi.Int32) -> mi.Bool:
         """Whether connections go through the boundary of object k: smooth, refracting, and nothing inside."""

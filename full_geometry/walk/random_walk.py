@@ -15,6 +15,7 @@ import mitsuba as mi
 from full_geometry.geometry.points import SurfacePoint, channel_mean, evaluate, lift, sided, surface_point
 from full_geometry.surface.textured import MediumAt
 from full_geometry.walk.media import Coefficients, WalkMedia, WalkMedium, ray_of
+from full_geometry.walk.priorities import OUTSIDE
 from halfspace_sss.physics.medium import eval_hg, sample_hg
 from halfspace_sss.tracing.walk import ROULETTE_BOOST, ROULETTE_WEIGHT, generator, pass_seed
 
@@ -141,7 +142,6 @@ def roulette(weight: mi.Spectrum, scale: mi.Float, u: mi.Float) -> tuple[mi.Bool
     return u < survive, dr.select(survive < 1, weight / dr.maximum(survive, 1e-30), weight)
 
 
-OUTSIDE = -1
 MET = 2  # scattering events at least, of a walk that has met something inside: such paths are a transport's
 Record = TypeVar("Record")  # of a visitor, any PyTree of Dr.Jit
 
@@ -162,6 +162,7 @@ class Walk:
     order: mi.UInt32  # scattering events since it entered the object; MET at least once it has met what lies inside
     rng: mi.PCG32
     medium: WalkMedium | tuple[()] = ()  # that it took where it entered, see `WalkMedia.fetch`
+    within: mi.UInt32 | tuple[()] = ()  # what is around it, where things overlap, see `walk.priorities`
 
     def ray(self, t: mi.Float) -> mi.Ray3f:
         """Looks for the boundary on a flight of length t; see `reach` for its distances."""
@@ -328,11 +329,19 @@ class Walker:
 
         # the flight goes on behind what it can meet only if rounding has put it there
         passes = (own & inwards) | ((nested | refracts) & (~inwards | (around != k)))
+        bsdf = dr.select(plain, si.bsdf(), media.boundary_pointer(dr.maximum(met, 0)))
+        to = dr.select(own, around, dr.select(nested, met, dr.select(refracts, OUTSIDE, k)))
+        if inner.priorities is not None:
+            of = inner.priorities.meet(si, ray.d, walk.within)
+            passes, to, bsdf = (
+                dr.select(of.member, a, b) for a, b in zip((of.passes, of.object, of.bsdf), (passes, to, bsdf))
+            )
+            met = dr.select(of.member & passes, k, met)
+            own &= (to >= 0) | (of.within == 0)
 
         # ---- light that the surface emits or sends on, then a direction by its BSDF
-        bsdf = dr.select(plain, si.bsdf(), media.boundary_pointer(dr.maximum(met, 0)))
         walk, record = self.visitor.surface(walk, record, si, bsdf, met)
-        walk, record = self.visitor.boundary(walk, record, si, own & ~passes & (around < 0))
+        walk, record = self.visitor.boundary(walk, record, si, own & ~passes & (to < 0))
         bs, value = sample_bsdf(bsdf, si, walk.rng)
         d, turned = sided(si, bs.wo)
         d = dr.select(plain, si.to_world(bs.wo), d)
@@ -341,8 +350,10 @@ class Walker:
         through = (mi.Frame3f.cos_theta(bs.wo) * mi.Frame3f.cos_theta(si.wi) < 0) & ~mi.has_flag(
             bs.sampled_type, mi.BSDFFlags.Null
         )
-        to = dr.select(own, around, dr.select(nested, met, dr.select(refracts, OUTSIDE, k)))
         through &= ~passes
+        leaves = own & through & (to < 0)
+        if inner.priorities is not None:
+            walk = replace(walk, within=dr.select(of.member & (through | passes), of.within, walk.within))
         to, d, value = dr.select(through, to, k), dr.select(passes, ray.d, d), dr.select(passes, 1, value)
         alive = si.is_valid() & (passes | ((bs.pdf > 0) & (dr.max(value) > 0)))
 
@@ -355,7 +366,7 @@ class Walker:
                        weight=walk.weight * value, scale=walk.scale * dr.select(passes, 1, dr.square(bs.eta)),
                        order=dr.select(own | passes, walk.order, dr.maximum(walk.order, MET)))  # fmt: skip
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | (turned & ~plain)
-        crossing = Crossing(si, mi.Vector3f(ray.d), own & through & (around < 0), bs.pdf, delta)
+        crossing = Crossing(si, mi.Vector3f(ray.d), leaves, bs.pdf, delta)
         return dr.if_stmt((walk, record, crossing), ~passes, self._cross, _pass, label="crossing")
 
     def _cross(self, walk: Walk, record: Record, crossing: Crossing) -> tuple[Walk, Record]:
@@ -595,6 +606,8 @@ def _enter(
 
     # ---- the walk, whose channel is drawn once
     walk = start_walk(si.p, d, rng, medium)
+    if media.overlaps:
+        walk.within = media.inner.priorities.start(mi.UInt32(k) + dr.zeros(mi.UInt32, dr.width(index)))
     enters = known & (dr.dot(w, si.n) > 0) & (dr.dot(d, si.n) < 0) & (dr.max(value) > 0)
     enters &= mi.Frame3f.cos_theta(si.wi) > 0
     channel = draw(len(value), rng) if len(value) > 1 else walk.channel

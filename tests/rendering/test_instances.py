@@ -297,15 +297,6 @@ def test_things_inside_instances_are_refused_by_models() -> None:
     assert "objects must be empty for models of their light" in found and "inside object 'box'" in found
 
 
-def test_instances_that_overlap_are_refused_by_name() -> None:
-    found = refusal(view(**light(), **shown({"box": box()}, [turned(0.0, 0), turned(0.4, 50)])))
-    assert (
-        "refracting shapes must lie inside an object or outside" in found
-        and "partly inside object 'box'" in found
-        and "'copy" in found
-    )
-
-
 def test_a_camera_inside_the_last_instance_is_refused() -> None:
     at = mi.ScalarTransform4f().translate([0, -2, 12]) @ turned(0.0, 30)
     found = refusal(view(**light(), **shown({"box": box()}, [*places(), at])))
