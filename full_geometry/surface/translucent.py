@@ -31,7 +31,7 @@ Parameters, all optional but the medium:
     channel: R, G or B, or a number; under a mono variant, for a medium with channels.
     dilution: of a material that has one, see `halfspace_sss.materials.load`.
     a BSDF inside: the boundary, a `dielectric` or `roughdielectric` with int_ior / ext_ior equal to the eta of the
-        medium; by default smooth. A rough one is traced by `translucent_walk` alone.
+        medium; by default smooth. A rough one takes `translucent_walk` or corrected light.
     reflection: whether the boundary reflects light, by default true.
     priority: where objects or glass overlap, space belongs to the larger one, by default 0. An object that has one, or
         lies inside another in part, has its eta over the index of what is around all of them.
@@ -222,7 +222,7 @@ def check_boundary(name: str, boundary: mi.BSDF) -> None:
     if wrong:
         raise ValueError(
             f"the boundary of object {name} must be {wrong[0]} under a model, got a {boundary.class_name()}: the "
-            "integrator translucent_walk traces it"
+            "integrator translucent_walk traces it, and corrected light takes it"
         )
 
 

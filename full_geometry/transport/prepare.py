@@ -39,7 +39,7 @@ from full_geometry.objects.objects import (
 )
 from full_geometry.settings import AUTO, AUTOMATIC, GATHERED_LIGHTS, Capabilities, Choices, Settings
 from full_geometry.surface.medium_derivatives import DifferentiableTransport, MediumDerivatives
-from full_geometry.surface.translucent import MediumSpec, check_boundary
+from full_geometry.surface.translucent import MediumSpec, check_boundary, is_smooth_boundary
 from full_geometry.surface.varying import equivalent, warn_of_means
 from full_geometry.surface.wrapped import surface_of
 from full_geometry.transport.half_space import check_turns, half_space_model
@@ -99,20 +99,22 @@ def _make_object(geometry: Geometry, spec: MediumSpec, settings: Settings) -> Tr
     if spec.spectral is not None:
         obj = replace(obj, spectral=spec.spectral.scaled(settings.mm_per_unit))
     single_only = spec.orders == "single" or not any(float(m.sigma_s) > 0 for m in media)
-    check_boundary(geometry.name, obj.surface.boundary)
+    corrected = settings.light == "corrected"
+    if not corrected:  # by walks, which know any boundary
+        check_boundary(geometry.name, obj.surface.boundary)
     obj.wrapping.check(geometry)
     if geometry.inclusions is not None:
         _check_takes(geometry, spec, single_only)
     capabilities = lookup(spec.model).capabilities
     derivatives = MediumDerivatives(obj.surface, settings.mm_per_unit, spec.model, capabilities.derivatives)
-    corrected = settings.light == "corrected"
-    if spec.orders == "total" and not (single_only or capabilities.straight or corrected):
+    exact = corrected and is_smooth_boundary(obj.surface.boundary)  # a rough one blurs what passes unscattered
+    if spec.orders == "total" and not (single_only or capabilities.straight or exact):
         check_turns(geometry, media, spec.model)
     none = ObjectModel(None, None)
     transport, proposals, entries = none if single_only else _model_of(obj, spec, settings)
     if transport and transport.orders == "total" and spec.orders == "multiple":
         raise ValueError(f"orders must be total for the model {spec.model!r}, which contains them all, got multiple")
-    low_orders = _low_orders(spec, transport, corrected)
+    low_orders = _low_orders(spec, transport, exact)
     if transport is not None and capabilities.derivatives and obj.textured is None and obj.spectral is None:
         transport = DifferentiableTransport(transport, derivatives)
     entries = entries if settings.entries == AUTOMATIC else settings.entries
