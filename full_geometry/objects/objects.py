@@ -478,7 +478,8 @@ def object_of(
     if spec.textured is not None:
         spec.textured.check(geometry)
         spec = replace(spec, textured=None) if spec.textured.is_even(geometry.shape) else spec
-    varying, textured = (part if part is None else part.scaled(unit) for part in (spec.varying, spec.textured))
+    varying = None if spec.varying is None else spec.varying.placed(geometry, unit)
+    textured = None if spec.textured is None else spec.textured.scaled(unit)
     return TranslucentObject(geometry, media, varying, textured)
 
 

@@ -100,6 +100,8 @@ def medium(spec: MediumSpec, mm_per_unit: float) -> mi.Medium:
     phase = {"type": "hg", "g": g} if g else {"type": "isotropic"}
     if spec.textured is not None:
         raise ValueError(f"media must be without textures for Mitsuba's media, got those of {spec.label}")
+    if spec.varying is not None and spec.varying.by_depth:
+        raise ValueError(f"media must be without layers for Mitsuba's media, got {spec.label}")
     if spec.varying is not None:
         return mi.load_dict({"type": "heterogeneous", **_volumes(spec.varying, mm_per_unit), "phase": phase})
     scale = float(np.max(m.sigma_t))  # Mitsuba takes colours up to one

@@ -20,6 +20,8 @@ Parameters, all optional but the medium:
         by commas), `g` and `eta`; or `sigma_t` (1/mm), `albedo` and `scale` (a factor of sigma_t) instead of the
         first two. For a medium that varies in space `albedo` and one of `sigma_t` and `scale` may be a `gridvolume`.
         For one that varies over the surface `albedo` and `sigma_t` may be textures of Mitsuba; see `surface.textured`.
+    layers: instead of these, layers below the surface, "NAME THICKNESS, ..., NAME" with names of materials and mm, or
+        "skin I" to "skin VI": epidermis on dermis. One g and eta; see `surface.layered`.
     reflectance, mfp: instead of these, the reflectance of the half-space under even light and the mean free path (mm),
         numbers or textures. Values of textures are taken as they are, above 1 too.
     model: name of a model of the library, by default "neural"; "neural_shape", which sees the shape and needs no
@@ -60,6 +62,7 @@ import numpy as np
 from full_geometry.geometry.points import mirrored, opaque
 from full_geometry.geometry.snapshot import held
 from full_geometry.settings import ORDERS, check_parameters, variant_channels
+from full_geometry.surface.layered import LayeredMedium, read_layers
 from full_geometry.surface.spectral import EVERYWHERE, MediumByWavelength, read_file, spectral_medium
 from full_geometry.surface.textured import TexturedMedium, constant_texture, textured_medium
 from full_geometry.surface.varying import VaryingMedium, constant_value, mean_of_grids, varying_medium
@@ -447,7 +450,7 @@ def _boundaries(props: mi.Properties) -> list[tuple[str, mi.BSDF]]:
 
 PARAMETERS = (
     "material", "sigma_s", "sigma_a", "sigma_t", "albedo", "scale", "reflectance", "mfp", "g", "eta", "model", "orders",
-    "channel", "dilution", "reflection", "spectra", "unit", "priority",
+    "channel", "dilution", "reflection", "spectra", "unit", "priority", "layers",
 )  # fmt: skip
 
 
@@ -554,7 +557,7 @@ COEFFICIENTS = ("sigma_s", "sigma_a", "sigma_t", "albedo", "scale", "reflectance
 
 def _by_wavelength(props: mi.Properties) -> tuple[str, Medium, MediumByWavelength]:
     """Read the medium under a spectral variant: its label, the medium at four wavelengths, and at all."""
-    for key in ("material", "dilution", "channel"):
+    for key in ("material", "dilution", "channel", "layers"):
         if key in props:
             raise ValueError(
                 f"{key} must be left out under a spectral variant, as the channels of materials are no spectra, got "
@@ -603,6 +606,12 @@ def _medium(props: mi.Properties) -> tuple[str, Medium, VaryingMedium | None, Te
         if key in props:
             raise ValueError(f"{key} must be left out but under a spectral variant, got {props[key]!r}")
     inline = {key: constant_texture(constant_value(props[key])) for key in COEFFICIENTS if key in props}
+    if "layers" in props:
+        if others := [*inline, *(key for key in ("material", "dilution") if key in props)]:
+            raise ValueError(f"layers must stand without {', '.join(others)}, got both")
+        media, thickness = read_layers(str(props["layers"]))
+        layered = LayeredMedium.of(tuple(_for_variant("layers", m, None, props)[1] for m in media), thickness)
+        return str(props["layers"]), layered.mean(), layered, None
     if "material" in props:
         if inline:
             raise ValueError(f"material must stand without {', '.join(inline)}, got both")

@@ -39,9 +39,15 @@ class VaryingMedium:
     albedo_volume: mi.Volume | None
     albedo: np.ndarray
 
+    by_depth = False  # whether the surface of an object decides, and `placed` asks for it
+
     def scaled(self, factor: float) -> VaryingMedium:
         """The same in other units of length: sigma_t times a factor."""
         return replace(self, factor=self.factor * factor)
+
+    def placed(self, obj: Geometry, mm_per_unit: float) -> VaryingMedium:
+        """The medium of an object, 1/(scene unit)."""
+        return self.scaled(mm_per_unit)
 
     @property
     def majorant(self) -> np.ndarray:
@@ -70,8 +76,10 @@ def eval_volume(volume: mi.Volume | None, p: mi.Point3f, active: mi.Bool = True)
     return mi.Spectrum(volume.eval(it, active))
 
 
-def grid_values(volume: mi.Volume) -> np.ndarray:
-    """The voxels of a grid, shape (z, y, x, channels)."""
+def grid_values(volume: Any) -> np.ndarray:
+    """All values of a volume, shape (z, y, x, channels): the voxels of a grid, those of layers one behind the other."""
+    if not isinstance(volume, mi.Volume):
+        return volume.values[None, None]
     return np.array(mi.traverse(volume)["data"])
 
 
@@ -162,10 +170,11 @@ def equivalent(spec: Any, obj: Geometry) -> Any:
     """The spec with a homogeneous medium, which models of the half-space take.
 
     Its sigma_s and sigma_a are the means over the volume of the object, its albedo and sigma_t those over textures.
+    Layers have theirs already, see `layered.LayeredMedium.mean`.
     """
     if spec.textured is not None:
         return replace(spec, medium=spec.textured.mean(spec.medium.g, spec.medium.eta, obj.shape))
-    if spec.varying is None:
+    if spec.varying is None or spec.varying.by_depth:
         return spec
     p = _points(obj.scene.bbox())
     if obj.closed:

@@ -89,7 +89,7 @@ def choices_of(scene: mi.Scene, settings: Settings, choose: Chooser) -> Choices:
 def _make_object(geometry: Geometry, spec: MediumSpec, settings: Settings) -> TranslucentObject:
     media = tuple(m.scaled(settings.mm_per_unit) for m in spec.channels())
     check_size(geometry, [float(m.sigma_t) for m in media], settings.mm_per_unit)
-    varying = None if spec.varying is None else spec.varying.scaled(settings.mm_per_unit)
+    varying = None if spec.varying is None else spec.varying.placed(geometry, settings.mm_per_unit)
     obj = TranslucentObject(geometry, media, varying)
     if spec.textured is not None:
         spec.textured.check(geometry)

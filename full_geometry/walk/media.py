@@ -198,14 +198,11 @@ class HeterogeneousMedia:
     majorants: list[mi.Float]
 
     @classmethod
-    def of(cls, specs: list[MediumSpec], mm_per_unit: float) -> HeterogeneousMedia:
+    def of(cls, specs: list[MediumSpec], objects: list[Geometry], mm_per_unit: float) -> HeterogeneousMedia:
         """The media of objects with these specs."""
-        media = [inside.varying or _homogeneous(inside.medium) for inside in specs]
-        tables = (
-            per_channel([m.factor for m in media], mm_per_unit),
-            per_channel([m.albedo for m in media], 1.0),
-            per_channel([m.majorant for m in media], mm_per_unit),
-        )
+        varying = [inside.varying or _homogeneous(inside.medium) for inside in specs]
+        media = [each.placed(obj, mm_per_unit) for each, obj in zip(varying, objects)]
+        tables = [per_channel([getattr(m, key) for m in media], 1.0) for key in ("factor", "albedo", "majorant")]
         dr.make_opaque(tables)
         return cls([m.density for m in media], [m.albedo_volume for m in media], *tables)
 
@@ -405,7 +402,8 @@ class WalkMedia:
         object.__setattr__(self, "any_straight", any(straight))
         object.__setattr__(self, "box", _bounds(self.scene))
         varies = any(inside.varying is not None for inside in specs)
-        object.__setattr__(self, "heterogeneous", HeterogeneousMedia.of(specs, self.mm_per_unit) if varies else None)
+        heterogeneous = HeterogeneousMedia.of(specs, self.objects, self.mm_per_unit) if varies else None
+        object.__setattr__(self, "heterogeneous", heterogeneous)
 
     def is_current(self) -> bool:
         """Whether the objects still have the shapes and the media that this was made of."""
