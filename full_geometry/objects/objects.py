@@ -58,7 +58,7 @@ from full_geometry.surface.wrapped import Wrapping, surface_of, wrapping_of
 from halfspace_sss import measure
 from halfspace_sss.checks import check_interval
 from halfspace_sss.physics import single_scattering
-from halfspace_sss.physics.medium import Medium
+from halfspace_sss.physics.medium import DIFFUSE_LIMIT, Medium
 from halfspace_sss.registry import bssrdf
 
 
@@ -404,6 +404,7 @@ def check_size(geometry: Geometry, sigma_t: Sequence[float], mm_per_unit: float)
     """
     size = geometry.size * (1 if geometry.group is None else geometry.group.scale)
     thickness = [size * value for value in sigma_t]
+    thickness = [value for value in thickness if value * DIFFUSE_LIMIT * 1.001 < min(thickness)]  # which has no length
     if min(thickness) < SMALL or max(thickness) > LARGE:
         warnings.warn(
             f"object {geometry.name} is {min(thickness):.3g} to {max(thickness):.3g} mean free paths across, "

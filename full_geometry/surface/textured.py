@@ -25,7 +25,7 @@ import numpy as np
 from full_geometry.geometry import mesh
 from full_geometry.geometry.points import MediumAt, SurfacePoint, opaque
 from full_geometry.geometry.shape import Geometry, name_of
-from halfspace_sss.physics.medium import Medium
+from halfspace_sss.physics.medium import Medium, diffuse_limit
 from halfspace_sss.physics.reflectance import albedo_of_reflectance, half_space_reflectance
 
 NODES = 1025  # of the table of x by reflectance
@@ -408,6 +408,8 @@ def textured_medium(values: dict[str, Any], g: np.ndarray | float, eta: float, c
     Raises:
         ValueError: a number is out of range, or as `TexturedMedium.check`.
     """
+    if not isinstance(values.get("mfp", 1.0), mi.Texture):
+        values = {name: diffuse_limit(value) if name == "mfp" else value for name, value in values.items()}
     for name, value in values.items():
         if not isinstance(value, mi.Texture):
             check_values(name, np.atleast_1d(np.asarray(value, dtype=float)))

@@ -17,6 +17,7 @@ from halfspace_sss.physics.reflectance import DIFFUSE, albedo_of_reflectance, ha
 
 INDICES = (0.01, 100.0)  # relative: beyond, Fresnel's moments lose their digits
 EXTINCTIONS = (1e-18, 1e18)  # 1/mm: of float32 sigma_t² and its inverse are in range
+DIFFUSE_LIMIT = 1e-3  # of the largest mean free path of all channels
 CLEAR = "a clear layer is sigma_s = 1e-9, g = 0"
 
 
@@ -70,6 +71,15 @@ def check_ratios(albedo: np.ndarray, g: np.ndarray, eta: np.ndarray) -> None:
     _check("albedo", albedo, (albedo >= 0) & (albedo <= 1), "in [0, 1]")
     _check("g", g, np.abs(g) < 1, "in the open interval (-1, 1)")
     _check("eta", eta, *_between(eta, INDICES))
+
+
+def diffuse_limit(mfp: np.ndarray) -> np.ndarray:
+    """Mean free paths of channels with 1e-3 of the largest in place of 0: light then leaves where it has entered.
+
+    Reflectance does not depend on it. Where all are 0 they stay so.
+    """
+    mfp = np.asarray(mfp, dtype=float)
+    return np.where(mfp == 0, DIFFUSE_LIMIT * np.max(mfp, initial=0.0), mfp)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,6 +154,8 @@ class Medium:
     def from_reflectance(cls, reflectance, mfp, g=0.0, eta=1.3, mu_i=DIFFUSE) -> Medium:
         """The medium whose half-space has a wanted reflectance, with the mean free path mfp = 1 / sigma_t (mm).
 
+        A mean free path of 0 in some channels is their diffuse limit, see `diffuse_limit`.
+
         What artists give: colour, radius and anisotropy (`subsurface_color`, `subsurface_radius` and
         `subsurface_scatter_anisotropy` of OpenPBR). `reflectance` is the fraction of incident flux that comes back out
         of the medium, without what the boundary mirrors, under uniform radiance from above ("diffuse") or at the cosine
@@ -154,7 +166,8 @@ class Medium:
             ValueError: a colour is out of reach at this eta, or another argument is out of range.
         """
         reflectance, mfp, g = (_number(n, v) for n, v in (("reflectance", reflectance), ("mfp", mfp), ("g", g)))
-        _check("mfp", mfp, np.isfinite(mfp) & (mfp > 0), "finite and > 0 (mm)")
+        mfp = diffuse_limit(mfp)
+        _check("mfp", mfp, np.isfinite(mfp) & (mfp > 0), "finite and > 0 (mm), or 0 in some channels")
         _check("g", g, np.abs(g) < 1, "in the open interval (-1, 1)")
         shape = _common_shape(reflectance=reflectance, mfp=mfp, g=g)
         eta = _index("eta", eta)

@@ -104,6 +104,8 @@ def test_results_do_not_depend_on_the_kernels_of_the_linear_algebra():
 def test_a_colour_and_a_mean_free_path_for_each_channel_are_kept():
     medium = Medium.from_reflectance([0.8, 0.5, 0.0], [2.0, 0.5, 0.1], g=[0.0, 0.5, 0.9], eta=1.4)
     np.testing.assert_allclose(medium.mfp, [2.0, 0.5, 0.1], rtol=1e-12)
+    limit = Medium.from_reflectance([0.7, 0.5, 0.2], [2.0, 0.5, 0.0])
+    np.testing.assert_allclose(limit.mfp, [2.0, 0.5, 2e-3], rtol=1e-12)
     np.testing.assert_allclose(medium.reflectance(), [0.8, 0.5, 0.0], rtol=1e-6, atol=1e-9)
 
 

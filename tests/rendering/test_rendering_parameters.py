@@ -115,3 +115,17 @@ def test_a_medium_out_of_range_is_refused_by_name():
     parameters["ball.bsdf.albedo"] = mi.Color3f(1.2)
     with pytest.raises((ValueError, RuntimeError), match="albedo must be in"):
         parameters.update()
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("integrator", ["translucent_walk", "bssrdf"])
+def test_a_channel_without_a_mean_free_path_has_the_reflectance_of_its_half_space(integrator: str) -> None:
+    """The mean over the disk of a ball under an even sky is the mean over exits by their cosine."""
+    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    view = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
+    wax = {"reflectance": "0.8,0.5,0.7", "mfp": "1,0.2,0", "reflection": False}
+    scene = {"type": "scene", "integrator": {"type": integrator, "mm_per_unit": 5.0, "hide_emitters": True},
+             "sensor": {"type": "orthographic", "to_world": view, "film": film}, "sky": {"type": "constant"},
+             "ball": {"type": "sphere", "bsdf": {"type": "translucent", **wax}}}  # fmt: skip
+    found = np.array(mi.render(mi.load_dict(scene), spp=2048, seed=1)).mean(axis=(0, 1)) * 4 / np.pi
+    assert found[2] == pytest.approx(0.7, rel=0.015)
