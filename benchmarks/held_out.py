@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from figures.modelling.head_and_leaf import Made, leaves
+from benchmarks.head_and_leaf import Made, leaves
 from full_geometry.learning.meshes import capsule, cut, join, length, margin, overlap, rotated, smoothstep
 
 STROKES = {  # of letters, in a square

@@ -15,9 +15,9 @@ import mitsuba as mi
 import numpy as np
 
 from benchmarks.published import deng
+from benchmarks.textures_figure import bands, mosaic
 from figures.computing.scans import BUNNY, MM_PER_UNIT
 from figures.parts.part import Row, SceneDict
-from figures.textures import bands, mosaic
 from full_geometry import inverse
 from full_geometry.geometry.mesh import vertex_positions
 from full_geometry.inverse.views import GivenView

@@ -1,17 +1,14 @@
-"""The files of a figure of images, names of methods in them, and the images of a thing against those of walks."""
+"""The files of a figure of images, and names of methods in them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-
-import numpy as np
+from collections.abc import Mapping, Sequence
 
 from figures.computing.contenders import VOLUMES, WALK
 from figures.computing.images import FLIP, Shot
-from figures.computing.references import against, reference_shot
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
-from figures.parts.part import Result, Row
+from figures.parts.part import Row
 from halfspace_sss.comparison.style import look, paper, saved
 
 
@@ -56,15 +53,3 @@ def label(method: str) -> str:
 def rows_of(scenes: Mapping[str, Sequence[Shot]], key: str) -> list[Row]:
     """Rows of the table of a figure: the numbers of each image but the references; `key` is what a scene is called."""
     return [{key: name, "model": shot.label, **shot.numbers} for name, shots in scenes.items() for shot in shots[1:]]
-
-
-def against_walks(results: Mapping[str, Result], name: str, models: Iterable[str]) -> list[Shot]:
-    """The images of a thing, exposed alike; with the mean of each over that of the walks."""
-    reference = reference_shot(results[f"{name}, path traced"])
-    shot, mask, stops = reference
-    shots = [shot]
-    for model in models:
-        image = results[f"{name}, {model}"].images["image"]
-        mean = float(np.float32(2.0**stops) * image[mask].mean() / shot.image[mask].mean())
-        shots.append(against(reference, label(model), image, **{"mean over path traced": mean}))
-    return shots

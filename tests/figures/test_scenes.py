@@ -8,8 +8,8 @@ import pytest
 pytest.importorskip("mitsuba")
 pytest.importorskip("igl")
 
-from figures import scenes  # noqa: E402
-from figures.modelling import head_and_leaf as head  # noqa: E402
+from benchmarks import head_and_leaf as head  # noqa: E402
+from benchmarks import scenes_figure as scenes  # noqa: E402
 from full_geometry.learning.meshes import make_shape  # noqa: E402
 
 

@@ -13,7 +13,7 @@ pytest.importorskip("mitsuba")
 pytest.importorskip("igl")
 pytest.importorskip("flip_evaluator")
 
-from figures import thin  # noqa: E402
+from benchmarks import thin_figure as thin  # noqa: E402
 from figures.parts import runner  # noqa: E402
 
 
@@ -25,6 +25,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(getattr(thin, name), "draft", value)
 
 
+@pytest.mark.slow
 def test_light_comes_through_a_leaf_by_the_network_of_all_shapes_and_not_by_a_half_space(
     small: None, tmp_path: Path
 ) -> None:

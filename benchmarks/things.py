@@ -1,16 +1,18 @@
-"""Things on their own under a small lamp and a dim even sky: the scene, and its images by walks and by models."""
+"""Things on their own under a small lamp and a dim even sky: the scene, images by walks and models, shots."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from figures.computing.references import reference_image
+from figures.computing.images import Shot
+from figures.computing.references import against, reference_image, reference_shot
 from figures.computing.scans import prepare
-from figures.parts.part import Params, Part, SceneDict, Task
+from figures.drawing.image_files import label
+from figures.parts.part import Params, Part, Result, SceneDict, Task
 
 
 class Staging(NamedTuple):
@@ -103,3 +105,15 @@ def shown(task: Task, scene_of: Callable[[Task], SceneDict]) -> dict[str, object
     description["integrator"]["light"] = "gathered"
     image = mi.render(load_scene(description, p["model"]), spp=p["spp"], seed=p["seed"] + 1)
     return {"image": np.array(image)[..., :3].astype(np.float32), "spp": p["spp"]}
+
+
+def against_walks(results: Mapping[str, Result], name: str, models: Iterable[str]) -> list[Shot]:
+    """The images of a thing, exposed alike; with the mean of each over that of the walks."""
+    reference = reference_shot(results[f"{name}, path traced"])
+    shot, mask, stops = reference
+    shots = [shot]
+    for model in models:
+        image = results[f"{name}, {model}"].images["image"]
+        mean = float(np.float32(2.0**stops) * image[mask].mean() / shot.image[mask].mean())
+        shots.append(against(reference, label(model), image, **{"mean over path traced": mean}))
+    return shots
