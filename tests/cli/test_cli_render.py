@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import time
@@ -28,6 +29,17 @@ def scene(tmp_path: Path, monkeypatch: Any) -> Path:
     file = tmp_path / "ball.xml"
     file.write_text(XML)
     return file
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The files of a render of two samples."""
+    file = tmp_path_factory.mktemp("rendered") / "ball.xml"
+    file.write_text(XML)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cli, "drawers", lambda: None)
+        assert _render(file, "--spp", "2").exit_code == 0
+    return file.parent / "out"
 
 
 def _render(file: Path, *arguments: str, out: str = "out") -> Any:
@@ -73,9 +85,9 @@ def test_a_scene_that_cannot_be_rendered_ends_with_2_and_one_line(case: str, sce
     ],
 )
 def test_a_wrong_argument_ends_with_2_and_leaves_the_files_of_before(
-    arguments: list[str], message: str, scene: Path
+    arguments: list[str], message: str, scene: Path, rendered: Path
 ) -> None:
-    assert _render(scene, "--spp", "2").exit_code == 0
+    shutil.copytree(rendered, scene.parent / "out")
     before = _set(scene.parent / "out")
     result = _render(scene, *arguments)
     assert result.exit_code == 2
@@ -137,9 +149,10 @@ def test_an_interrupt_keeps_the_files_of_before_and_what_is_done_under_another_n
 
 
 @pytest.mark.parametrize("call", range(8))
-def test_a_full_disk_at_any_write_leaves_files_of_one_render(call: int, scene: Path, monkeypatch: Any) -> None:
-    assert _render(scene, "--spp", "2").exit_code == 0
-    out = scene.parent / "out"
+def test_a_full_disk_at_any_write_leaves_files_of_one_render(
+    call: int, scene: Path, rendered: Path, monkeypatch: Any
+) -> None:
+    out = shutil.copytree(rendered, scene.parent / "out")
     before, calls = _set(out), []
 
     def refuse(*_: Any, do: Any) -> Any:
@@ -258,8 +271,16 @@ def test_light_met_by_chance_is_told_in_a_sentence_where_it_is_a_share_of_noise_
 
 
 @pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
-@pytest.mark.parametrize("model", ["better_dipole", "path_traced"])
-@pytest.mark.parametrize("after", [0.05, 0.5, 1.0, 1.5, 2.0])
+@pytest.mark.parametrize(
+    ("model", "after"),
+    [
+        ("better_dipole", 0.05),
+        ("better_dipole", 1.0),
+        ("better_dipole", 2.0),
+        ("path_traced", 0.5),
+        ("path_traced", 1.5),
+    ],
+)
 def test_an_interrupt_at_any_moment_ends_with_130_and_one_line(model: str, after: float, scene: Path) -> None:
     run = [*START, "render", str(scene), "--model", model, "--spp", "1e7", "--out", str(scene.parent / "out")]
     process = subprocess.Popen([run[0], "-c", "print('ready', flush=True); " + run[2], *run[3:]],

@@ -17,7 +17,9 @@ mi = pytest.importorskip("mitsuba")
 from figures import app as cli  # noqa: E402
 from full_geometry.learning import model_errors  # noqa: E402
 from full_geometry.scenes.scene_files import load_scene  # noqa: E402
+from full_geometry.settings import Settings  # noqa: E402
 from full_geometry.transport.models import lookup, model_names  # noqa: E402
+from full_geometry.transport.prepare import make_objects  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -89,20 +91,20 @@ def test_it_warns_by_name_and_number_out_of_its_range(ball: dict, surface: dict,
         content["ball"]["to_world"] = mi.ScalarTransform4f().scale(ball["to_world"])
         del content["ball"]["radius"]
     with pytest.warns(UserWarning, match="neural_shape was trained on") as caught:
-        mi.render(load_scene(content), spp=1)
+        make_objects(load_scene(content), Settings())
     assert any(re.search(words, str(w.message)) for w in caught)
 
 
 def test_it_warns_of_a_clear_object_by_its_mean_chord() -> None:
     """4/3 of the radius of 3: in grapefruit juice it was 1.13 of walks under a lamp, without a word."""
     with pytest.warns(UserWarning, match="object 'ball' is clear for neural_shape.*mean chord is 2.6, 2.6, 2.6 transp"):
-        mi.render(load_scene(scene(sigma_s=0.6, sigma_a=0.05)), spp=1)
+        make_objects(load_scene(scene(sigma_s=0.6, sigma_a=0.05)), Settings())
 
 
 def test_within_its_range_it_says_nothing() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        mi.render(load_scene(scene(orders="multiple")), spp=1)
+        make_objects(load_scene(scene(orders="multiple")), Settings())
 
 
 def test_a_rough_boundary_is_refused() -> None:

@@ -84,7 +84,7 @@ def _image(to: Frame, *scene: Any, spp: int = 128, seed: int = 1) -> np.ndarray:
 
 
 WALK, MODEL = {"type": "translucent_walk"}, {"type": "bssrdf", "light": "sampled"}
-LEAF, BALL = (_box, (8, 8, 0.025)), (_ball, (2, 2, 2))
+LEAF, BALL = (_box, (2, 2, 0.025)), (_ball, (2, 2, 2))
 AWAY = Frame((300, 200, -100), 1e3)  # in micrometres
 by_walk_and_model = pytest.mark.parametrize("integrator", [WALK, MODEL], ids=["walk", "model"])
 
