@@ -183,14 +183,7 @@ Library: TypeAlias = "_NumpyLibrary | _TorchLibrary | _DrJitLibrary"
 _NUMPY = _NumpyLibrary()
 
 
-@once
-def _torch_library() -> _TorchLibrary:
-    return _TorchLibrary()
-
-
-@once
-def _drjit_library() -> _DrJitLibrary:
-    return _DrJitLibrary()
+_torch_library, _drjit_library = once(_TorchLibrary), once(_DrJitLibrary)
 
 
 def asks_nothing(lib: Library, args: tuple) -> bool:

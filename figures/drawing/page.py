@@ -7,6 +7,7 @@ import html
 import io
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from typing import TYPE_CHECKING
@@ -66,17 +67,7 @@ def page(
     content = {name: html.escape(text) for name, text in (("title", title), ("caption", caption), ("notes", notes))}
     content |= {"style": _file("page.css"), "script": _file("page.js")}
     content["data"] = json.dumps(data, allow_nan=False, ensure_ascii=False).replace("</", "<\\/")
-    return _filled(_file("page.html"), content)
-
-
-def _filled(template: str, content: Mapping[str, str]) -> str:
-    """The template with {{name}} replaced; what is put in is not looked at again."""
-    pieces = template.split("{{")
-    text = pieces[0]
-    for piece in pieces[1:]:
-        name, rest = piece.split("}}", 1)
-        text += content[name] + rest
-    return text
+    return re.sub(r"\{\{(\w+)\}\}", lambda name: content[name[1]], _file("page.html"))
 
 
 def _file(name: str) -> str:

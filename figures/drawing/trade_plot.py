@@ -87,8 +87,8 @@ def pareto(
         )  # fmt: skip
         handles[style.label] = handle
         if not exact:
-            low, high = _interval(row)
-            ax.plot([x, x], [max(low, LEAST), max(high, LEAST)], color=style.color, lw=0.8, zorder=2)
+            ends = [max(math.sqrt(max(row.bias2 + s * row.bias2_error, 0.0)), LEAST) for s in (-1, 1)]
+            ax.plot([x, x], ends, color=style.color, lw=0.8, zorder=2)
     _front(ax, [(time_to_noise(w, pixels), 0.0 if w.way == TRACED else w.bias) for w in rows])
     ax.axhline(tolerance, color="0.55", lw=0.6, ls=(0, (4, 3)), zorder=0)
     ax.set(xscale="log", yscale="log", xlabel=f"time to {100 * NOISE:g} % noise [s]", ylabel="bias of radiance")
@@ -102,12 +102,6 @@ def pareto(
     ax.set_xlim(min(xs) / 2, max(xs) * 4)
     _plain(ax)
     return handles
-
-
-def _interval(row: TechniqueTrade) -> tuple[float, float]:
-    """Bias within one standard error of its square."""
-    low, high = row.bias2 - row.bias2_error, row.bias2 + row.bias2_error
-    return math.sqrt(max(low, 0.0)), math.sqrt(max(high, 0.0))
 
 
 def _front(ax: Axes, points: list[tuple[float, float]]) -> None:

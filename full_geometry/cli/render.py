@@ -173,7 +173,8 @@ def _image(
         clean = cross_denoised(result, denoise) if denoise else None
         told, error = _numbers(result), _error(result, way.limits.target_error or SMALL_ERROR)
         off = (clean.image, {"error": clean.told}) if clean else None
-        picture = Picture(file.stem, _colours(result.mean), told, error, off)
+        colours = result.mean[..., :3] if result.mean.shape[2] >= 3 else result.mean[..., :1].repeat(3, axis=2)
+        picture = Picture(file.stem, colours, told, error, off)
         drawn = drawers.render(picture) if drawers and (off or not images.frames) else {}
         files = _publish(picture, file, {end: drawn[end] for end in drawn if not (images.frames and end == "html")})
         shared.say(f"{result.spp} samples a pixel in {result.seconds:.1f} s; {error}")
@@ -383,10 +384,6 @@ def _publish(picture: Picture, file: Path, drawn: dict[str, bytes]) -> list[Path
     gone = [file.with_suffix(f".{ending}") for ending in (*ENDINGS, *PHASES) if ending not in endings]
     replace_together(moves, gone)
     return [path for path in moves.values() if path.suffix != ".json"]
-
-
-def _colours(image: np.ndarray) -> np.ndarray:
-    return image[..., :3] if image.shape[2] >= 3 else image[..., :1].repeat(3, axis=2)
 
 
 def _numbers(reference: Reference) -> dict[str, str]:

@@ -144,7 +144,8 @@ class Corrections:
         number = int(np.clip(samples // SAMPLES_PER_WALK, FEWEST, MOST))
         launches = 2 * round(number / (2 * PER_LAUNCH))
         if any(known is None or known.launches < launches for known in self._known):
-            tracer = _tracer(scene, settings, number)
+            walk = mi.load_dict({"type": "translucent_walk", **settings.shared()})
+            tracer = replace(walk.tracer(scene, SEED, 4 * number), begins_inside=True)
             for k, known in enumerate(self._known):
                 first, halves = (known.launches, list(known.halves)) if known else (0, _nothing(gathered[k]))
                 for launch in range(first, launches):
@@ -171,12 +172,6 @@ def _check(obj: TranslucentObject) -> None:
 
 def _nothing(gathered: Gathered) -> list[ResidualSums]:
     return [ResidualSums.zeros(len(gathered.points), dr.size_v(mi.Spectrum))] * 2
-
-
-def _tracer(scene: mi.Scene, settings: Settings, number: int) -> PathTracer:
-    """Paths that go in where they begin."""
-    walk = mi.load_dict({"type": "translucent_walk", **settings.shared()})
-    return replace(walk.tracer(scene, SEED, 4 * number), begins_inside=True)
 
 
 def residuals(

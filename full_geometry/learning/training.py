@@ -379,7 +379,7 @@ class _ObjectTraining:
         saved, what = time.monotonic(), "training"
         while self.done < self.total and not self._reached(target):
             self._chunk(seconds)
-            validates = self.done in self._marks()
+            validates = self.done in {round(self.total * (k + 1) / VALIDATIONS) for k in range(VALIDATIONS - 1)}
             if validates:
                 self.history.append(self._validated(truth))
                 what = f"training (error {self.history[-1][1]:.3f} ± {self.history[-1][2]:.3f})"
@@ -440,9 +440,6 @@ class _ObjectTraining:
         self.total = chunks
         if self.work:
             write_atomically(self.work / PLAN, to_json({"chunks": chunks}))
-
-    def _marks(self) -> set[int | float]:
-        return {round(self.total * (k + 1) / VALIDATIONS) for k in range(VALIDATIONS - 1)}
 
     def _data(self, k: int) -> tuple[Pairs, Pairs]:
         if self.seen:

@@ -205,7 +205,9 @@ class SceneSamples:
         objects, compiled = [], 0.0
         for k, (points, sampled) in enumerate(zip(self.points, self.sampled)):
             if points is None:
-                objects.append(_unseen(self.on.names[k], self.mfp[k]))
+                name = self.on.names[k]
+                note = f"object {name!r} is hardly seen by the camera, if at all: nothing can be measured of it"
+                objects.append(ObjectTrade(name, self.mfp[k], 0.0, 0.0, (), (), (note,)))
                 continue
             rows, reference = [], sampled[self.reference(k)]
             for technique, item in sampled.items():
@@ -231,11 +233,6 @@ class SceneSamples:
         """Spent, compilation left out."""
         compiling = sum(each.compiling for of in self.sampled for i in of.values() if isinstance(i, list) for each in i)
         return clock() - self.started - compiling
-
-
-def _unseen(name: str, mfp: tuple[float, float]) -> ObjectTrade:
-    note = f"object {name!r} is hardly seen by the camera, if at all: nothing can be measured of it"
-    return ObjectTrade(name, mfp, 0.0, 0.0, (), (), (note,))
 
 
 def _mfp(on: Stage, k: int) -> tuple[float, float]:
@@ -286,7 +283,8 @@ def _row(
     variance = relative_variance(cost, b)
     if technique.light == PRECOMPUTED:
         # Rays of light are as many as samples: their noise falls with that of walks.
-        noise, samples = noise_of_parts(parts, b), _samples_of_pixel(on)
+        pixels = math.prod(int(n) for n in on.scene.sensors()[0].film().crop_size())
+        noise, samples = noise_of_parts(parts, b), RAYS * SAMPLES_PER_RAY / pixels  # of a pixel
         variance = Number(variance.value + samples * noise.value, math.hypot(variance.error, samples * noise.error))
     return TechniqueTrade(
         way=technique.name, bias2=bias2.value, bias2_error=bias2.error, ratio=tuple(r[0] for r in ratios),
@@ -301,11 +299,6 @@ def _of_precomputed(walked: Sampled, parts: list[RadianceEstimate]) -> Number:
     noise = relative_variance(walked.estimate, joined(parts)).value / max(walked.estimate.samples, 1)
     found = mean_square_of_parts(parts, walked.estimate, 0.0)
     return with_prior(found, KNOWN_BIAS2) if noise < TELLING else Number(0.0, KNOWN_BIAS2)
-
-
-def _samples_of_pixel(on: Stage) -> float:
-    """Of an image whose walks have as many rays of light as those that are measured."""
-    return RAYS * SAMPLES_PER_RAY / math.prod(int(n) for n in on.scene.sensors()[0].film().crop_size())
 
 
 def _kept(on: Stage, k: int, technique: Technique) -> float:

@@ -178,7 +178,8 @@ def sample_more(
         if samples:
             each = samples - sampled.estimate.samples
         else:
-            each = _affordable(sampled, exits.n, seconds - (clock() - started))
+            left = max(seconds - (clock() - started) - sampled.overhead, 0)
+            each = int(left / (sampled.seconds * exits.n))
         if not sampled.estimate.samples:
             each = max(each, PILOT)
         if each < FEWEST:
@@ -210,11 +211,6 @@ def sample_blur(stage: Stage, exits: Exits, seed: int, samples: int) -> Radiance
         )
         estimate.add(*_sums([b - a for a, b in zip(without, spread)], each), each)
     return estimate
-
-
-def _affordable(sampled: Sampled, n: int, left: float) -> int:
-    """Samples of each exit that the rest of the time allows."""
-    return int(max(left - sampled.overhead, 0) / (sampled.seconds * n))
 
 
 class TimedLaunch(NamedTuple):

@@ -70,19 +70,12 @@ def mixed(obj: TranslucentObject) -> list[Mixed]:
     """What each channel mixes; M and m_2 are 0 where there is no scattering or no volume."""
     at = obj.random_points(generator(_mitsuba(), POINTS, pass_seed(SEED)))
     entering, chord = refract_in(at, obj.eta)[1], max(mean_chord(obj), 0.0)
-    kinds = [obj.media, *(tuple(map(kind, obj.media)) for kind in (_reduced, _unbounded))]
+    isotropic = tuple(Medium(float(m.sigma_s) * (1 - float(m.g)), float(m.sigma_a), 0.0, m.eta) for m in obj.media)
+    kinds = [obj.media, isotropic, tuple(Medium(m.sigma_s, m.sigma_a, m.g, 1.0) for m in obj.media)]
     P = [first_event(replace(obj, media=media), at).P for media in kinds]
     through = [entering, entering, 1.0]
     scattered = [[float(np.mean((F_t * p).numpy())) for p in each] for F_t, each in zip(through, P)]
     return [_of(obj, media, parts, chord) for media, parts in zip(zip(*kinds), zip(*scattered))]
-
-
-def _reduced(m: Medium) -> Medium:
-    return Medium(float(m.sigma_s) * (1 - float(m.g)), float(m.sigma_a), 0.0, m.eta)
-
-
-def _unbounded(m: Medium) -> Medium:
-    return Medium(m.sigma_s, m.sigma_a, m.g, 1.0)
 
 
 def _of(obj: TranslucentObject, media: Sequence[Medium], scattered: Sequence[float], chord: float) -> Mixed:

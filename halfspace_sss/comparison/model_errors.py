@@ -150,9 +150,8 @@ def model_error(model: BSSRDF, reference: TracedMaps, within: tuple[float, float
         rows = np.broadcast_to((decade == d)[:, None, :, None], traced.shape)
         share = traced[rows].sum()
         if share > 1e-4 * total:
-            decades[f"{10.0**d:g}-{10.0 ** (d + 1):g}"] = float(
-                _denoised(deviation[rows].sum(), noise[rows].sum()) / share
-            )
+            square = float(deviation[rows].sum()) ** 2 - float(noise[rows].sum()) ** 2
+            decades[f"{10.0**d:g}-{10.0 ** (d + 1):g}"] = math.sqrt(max(square, 0.0)) / float(share)
     bias, parts = float((E.sum() - traced.sum()) / total), (deviation, noise, traced if traced.any() else E)
     known = _known(*(np.asarray(part.sum(axis=(1, 2, 3)), np.float64) for part in parts))
     return ModelError(known.value, raw, blur, bias, bias_noise, decades, *known)
@@ -174,10 +173,6 @@ def _known(deviation: np.ndarray, noise: np.ndarray, energy: np.ndarray) -> Nois
     left_out = square(*(total - v for total, v in zip(sums, (deviation, noise, energy))))
     spread = 2 * (n - 1) / n * np.sum((left_out - left_out.mean()) ** 2)
     return NoiseFree(float(square(*sums)), math.sqrt(float(spread)))
-
-
-def _denoised(raw: float, noise: float) -> float:
-    return math.sqrt(max(raw * raw - noise * noise, 0.0))
 
 
 def _reciprocal_directions(medium: Medium, n_sets: int, n_psi: int, rng: np.random.Generator) -> Groups:

@@ -52,11 +52,6 @@ def default_paths(medium: Medium, backend: str = "llvm") -> int:
     return int(min(max(float(f"{paths:.2g}"), FEWEST), MOST))
 
 
-def _at_middle(line: Line, model: BSSRDF, mu_i: float) -> np.ndarray:
-    """S of a model at the middle of each cell, 1/(mm² sr)."""
-    return _S(line, model, np.sqrt(line.r_edges[:-1] * line.r_edges[1:]), mu_i, line.phi)
-
-
 def _cell_mean(line: Line, model: BSSRDF, mu_i: float) -> np.ndarray:
     """S of a model as a mean over each cell, which is what the tracer measures: 4 x 5 Gauss nodes."""
     x, w = np.polynomial.legendre.leggauss(4)
@@ -191,7 +186,8 @@ def _modelled(model: BSSRDF, theta_deg: float, line: Line, orders: str) -> Curve
     R, error = sampled_reflectance(model, mu_i, points=REFLECTANCE_POINTS)
     if order != model.orders:
         R += float(single_scattering.reflectance(model.medium, mu_i))
-    S, S_at_r = _cell_mean(line, model, mu_i), _at_middle(line, model, mu_i)
+    middle = np.sqrt(line.r_edges[:-1] * line.r_edges[1:])
+    S, S_at_r = _cell_mean(line, model, mu_i), _S(line, model, middle, mu_i, line.phi)
     return Curve(model.name, model.orders, theta_deg, S, S_at_r, np.zeros_like(S), {order: (R, error)})
 
 

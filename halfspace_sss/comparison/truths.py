@@ -371,7 +371,8 @@ def _run(group: Sequence[Truth], n_paths: int, seed: int) -> list[Comparison]:
     edges = sorted({r for t in group if t.ring for r in t.ring})
     if group[0].times:
         return _run_in_time(group, edges or FREQUENCY_RADII, n_paths, seed)
-    padded = directions + directions[:1] * (_padded(len(directions)) - len(directions))
+    count = next((n for n in DIRECTION_COUNTS if n >= len(directions)), len(directions))
+    padded = directions + directions[:1] * (count - len(directions))
     result = trace(medium, mu_i, n_paths, seed, directions=padded or None, radii=edges or None)
     comparisons = []
     for truth in group:
@@ -393,10 +394,6 @@ def _run_in_time(group: Sequence[Truth], radii: Sequence[float], n_paths: int, s
         value, error = (float(t.factor * v[at]) for v in (values, errors))
         comparisons.append(Comparison(t, value, error, result.n_paths, result.n_events, seed))
     return comparisons
-
-
-def _padded(count: int) -> int:
-    return next((n for n in DIRECTION_COUNTS if n >= count), count)
 
 
 def _answer(truth: Truth, result: Trace, directions: list, edges: list[float]) -> Estimate:

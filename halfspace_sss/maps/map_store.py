@@ -93,13 +93,10 @@ def drop_cut_off(path: Path, units: set[tuple[int, int]]) -> None:
             place = chunk.name.split(".")
             if len(place) < 2 or not all(part.isdecimal() for part in place[:2]):
                 continue
-            if about["chunks"][:2] == [1, 1] and (int(place[0]), int(place[1])) in units and _is_cut_off(chunk):
-                chunk.unlink()
-
-
-def _is_cut_off(chunk: Path) -> bool:
-    told, length = _told(chunk)
-    return length < max(told[2], HEAD.size)
+            if about["chunks"][:2] == [1, 1] and (int(place[0]), int(place[1])) in units:
+                told, length = _told(chunk)
+                if length < max(told[2], HEAD.size):
+                    chunk.unlink()
 
 
 def _told(chunk: Path) -> tuple[tuple[int, int, int], int]:

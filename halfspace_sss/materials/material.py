@@ -23,11 +23,6 @@ def key_of(name: str) -> str:
     return "".join(c for c in name.casefold().replace("&", "and") if c.isalnum())
 
 
-def _check_text(name: str, value: object) -> None:
-    if not isinstance(value, str) or not value.strip():
-        raise ValueError(f"{name} must be a text that is not empty, got {value!r}")
-
-
 def _check_name(name: str) -> None:
     if not key_of(name):
         raise ValueError(f"name must contain a letter or a digit, got {name!r}")
@@ -77,7 +72,9 @@ class Material:
 
     def __post_init__(self) -> None:
         for name in ("name", "set", "source"):
-            _check_text(name, getattr(self, name))
+            value = getattr(self, name)
+            if not isinstance(value, str) or not value.strip():
+                raise ValueError(f"{name} must be a text that is not empty, got {value!r}")
         _check_name(self.name)
         if not isinstance(self.medium, Medium):
             raise ValueError(f"medium must be a Medium, got {type(self.medium).__name__}")
