@@ -17,14 +17,14 @@ from typer.testing import CliRunner
 
 from figures import app as cli
 from halfspace_sss import Medium
-from halfspace_sss.locks import one_writer
 from halfspace_sss.maps.grid import MapGrid
 from halfspace_sss.maps.map_store import load_maps, make_maps
+from halfspace_sss.provenance import one_writer
 
 HOLD = """
 import sys
 from pathlib import Path
-from halfspace_sss.locks import one_writer
+from halfspace_sss.provenance import one_writer
 
 with one_writer(Path(sys.argv[1])):
     print("held", flush=True)

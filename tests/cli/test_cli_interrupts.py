@@ -139,7 +139,7 @@ sss.trace(medium, n_paths=256)
 print('ready', flush=True)
 sss.trace(medium, n_paths=10**8)"""
     process = _started(body, tmp_path)
-    time.sleep(4)  # launches have found their size
+    time.sleep(2.5)  # launches have found their size
     started = time.monotonic()
     process.send_signal(signal.SIGINT)
     _, messages = process.communicate(timeout=60)
@@ -158,7 +158,7 @@ def told(done, total, what):
         print('ready', flush=True)
 make_maps(media, "maps", grid=MapGrid(2, 16, 6, 4), target_error=None, n_paths=2**21, progress=told)"""
     process = _started(body, tmp_path)
-    time.sleep(4)  # into a kernel of long walks
+    time.sleep(2.5)  # into a kernel of long walks
     started = time.monotonic()
     process.send_signal(signal.SIGINT)
     _, messages = process.communicate(timeout=60)

@@ -80,13 +80,6 @@ def test_every_channel_of_every_material_has_its_row_and_weights() -> None:
     assert all(row[4] == "<" or row[5] == "±" for row in rows)  # no error is told as if it were exact
 
 
-def test_given_coefficients_are_trained() -> None:
-    assert (
-        _invoke("train", "material", "--albedo", "0.6", "--g", "0.2", "--eta", "1.1", "--sigma-t", "3").exit_code == 0
-    )
-    assert _record(_weights()[0])["medium"] == {"albedo": pytest.approx(0.6), "g": 0.2, "eta": 1.1}
-
-
 @pytest.mark.slow
 def test_the_network_of_the_paper_is_trained_by_name() -> None:
     assert _invoke("train", "material", "--model", "neural_paper", "--steps", "2").exit_code == 0
@@ -209,9 +202,11 @@ def test_errors_are_repeated_by_their_seed() -> None:
     assert Path("a/errors.csv").read_bytes() == Path("b/errors.csv").read_bytes()
 
 
-def test_a_trained_material_is_among_the_errors() -> None:
-    assert _invoke("train", "material", "--albedo", "0.6").exit_code == 0
-    result = _errors("--albedo", "0.6", "--events", "2e4", "--model", "neural_material")
+def test_given_coefficients_are_trained_and_among_the_errors() -> None:
+    medium = ("--albedo", "0.6", "--g", "0.2", "--eta", "1.1", "--sigma-t", "3")
+    assert _invoke("train", "material", *medium).exit_code == 0
+    assert _record(_weights()[0])["medium"] == {"albedo": pytest.approx(0.6), "g": 0.2, "eta": 1.1}
+    result = _errors(*medium, "--events", "2e4", "--model", "neural_material")
     assert result.exit_code == 0 and "neural_material" in result.stdout
 
 

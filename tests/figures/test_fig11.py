@@ -15,7 +15,7 @@ from figures import fig11
 from figures.computing import timed
 from figures.computing.contenders import VOLUMES, contender
 from figures.computing.timed import alternating, pass_size
-from figures.drawing.image_files import label
+from figures.drawing.image_grid import label
 from figures.parts.part import Part, Result, Task
 from full_geometry.trade.denoising import denoised, guides
 from halfspace_sss.backend import BackendError

@@ -74,7 +74,8 @@ def ball(radius: float = 2.0) -> object:
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     mi.set_variant("llvm_ad_rgb")
-    return train(ball(), WAX, chunks=CHUNKS, recipe=QUICK, folder=tmp_path_factory.mktemp("weights"))
+    folder = tmp_path_factory.mktemp("trained")
+    return train(ball(), WAX, chunks=CHUNKS, recipe=QUICK, folder=folder / "weights", work=folder / "work")
 
 
 def constant(found: list) -> np.ndarray:
@@ -190,10 +191,10 @@ def test_a_killed_run_ends_with_the_same_weights(tmp_path: Path, monkeypatch: py
     assert all(np.array_equal(v, again.sampler.weights[name]) for name, v in whole.sampler.weights.items())
 
 
-def test_work_of_another_object_is_refused(tmp_path: Path) -> None:
-    train(ball(), WAX, chunks=1, recipe=QUICK, folder=tmp_path / "a", work=tmp_path / "work")
+def test_work_of_another_object_is_refused(trained: Trained) -> None:
+    folder = trained.path.parents[1]
     with pytest.raises(ValueError, match="size_in_mfp"):
-        train(ball(2.5), WAX, chunks=1, recipe=QUICK, folder=tmp_path / "a", work=tmp_path / "work")
+        train(ball(2.5), WAX, chunks=CHUNKS, recipe=QUICK, folder=folder / "weights", work=folder / "work")
 
 
 def test_a_run_stops_where_its_error_is_small_enough(tmp_path: Path) -> None:

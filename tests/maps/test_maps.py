@@ -27,7 +27,7 @@ SMALL = MapGrid(n_theta=3, n_phi=16, n_r=10, n_psi=8)
     "medium", [FIG10, FORWARD, Medium.from_albedo(0.6, 1.0, -0.5, 0.8)], ids=["fig10", "g0.8", "eta0.8"]
 )
 def test_a_map_summed_over_the_plane_is_the_angular_reflectance(medium):
-    unit = MapUnit(medium, SMALL, 1, 3, 0, None, 400_000)
+    unit = MapUnit(medium, SMALL, 1, 3, 0, None, 200_000)
     result = trace_unit(unit)
     mu_i, mu_o, delta_phi = map_directions(medium, SMALL, 3)
     r, psi = cell_edges(medium, SMALL)
@@ -35,7 +35,7 @@ def test_a_map_summed_over_the_plane_is_the_angular_reflectance(medium):
     total = (result.S * area).sum(axis=(1, 2))
     error = np.sqrt((result.variance * area**2).sum(axis=(1, 2)))
     directions = np.stack([mu_o[1], delta_phi[1]], axis=1)
-    truth = trace(medium, float(mu_i[1]), 1_000_000, seed=9, directions=directions).angular_reflectance("multiple")
+    truth = trace(medium, float(mu_i[1]), 500_000, seed=9, directions=directions).angular_reflectance("multiple")
     outside = 0.01 * truth.value  # light beyond the last edge and inside the first
     z = (total - truth.value) / np.hypot(np.hypot(error, truth.standard_error), outside)
     assert np.all(np.abs(z) < 4), z  # 48 numbers, significance 3e-3 with Bonferroni

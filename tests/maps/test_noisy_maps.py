@@ -43,7 +43,7 @@ def references() -> list[TracedMaps]:
     """Reciprocal maps of each medium: the same 8 x 16 pairs of directions in all copies."""
     rng = np.random.default_rng(5)
     parts = [_joined([errors._reciprocal_directions(m, 1, GRID.n_psi, rng)] * COPIES) for m in MEDIA]
-    halves = make_pool(_joined(parts), GRID, 6e7, (9,)).reshape(len(MEDIA), COPIES * SET, 2, 16, 24, 8)
+    halves = make_pool(_joined(parts), GRID, 4e7, (9,)).reshape(len(MEDIA), COPIES * SET, 2, 16, 24, 8)
     return [TracedMaps(m, p, GRID, errors._mean_of_both_ways(p, h), 1) for m, p, h in zip(MEDIA, parts, halves)]
 
 
@@ -70,7 +70,7 @@ def test_the_sum_over_the_plane_is_the_traced_reflectance(references: list[Trace
     value, error = total.mean(axis=0), total.std(axis=0, ddof=1) / math.sqrt(2 * COPIES)
     r = g.L[0] * np.log1p(np.exp(radial_edges(g, GRID)[0]))
     missing = 2 * rows[..., 0].mean(axis=0) * r[0] ** 2 / (r[1] ** 2 - r[0] ** 2) + 2 * rows[..., -1].mean(axis=0)
-    n_paths = 2_000_000 if medium.albedo < 0.5 else 600_000
+    n_paths = 1_200_000 if medium.albedo < 0.5 else 400_000
     directions = list(zip(g.mu_o[0], g.delta_phi[0]))
     expected, its_error = trace(medium, float(g.mu_i[0]), n_paths, 3, directions=directions).angular_reflectance(
         "multiple"

@@ -11,7 +11,7 @@ from scipy.special import i0e
 
 import halfspace_sss
 from halfspace_sss.arrays import library
-from halfspace_sss.comparison.cell_energies import BRIGHT, FIRST_N_PSI, N_U, cell_energies
+from halfspace_sss.comparison.model_errors import BRIGHT, FIRST_N_PSI, N_U, cell_energies
 from halfspace_sss.maps.noisy_maps import CellGrid, Groups, radial_edges
 from halfspace_sss.physics.backbone import unwarp
 

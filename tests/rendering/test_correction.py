@@ -99,34 +99,55 @@ def _image(scene: Any, spp: int = 64, seed: int = 0) -> np.ndarray:
     return np.array(mi.render(scene, spp=spp, seed=seed), dtype=float)
 
 
+class _Left(Corrections):
+    """Leaves gathered light as it is."""
+
+    def of(self, scene: Any, objects: list, settings: Any, samples: int) -> list:
+        return objects
+
+
+def _with(scene: Any, corrections: Corrections) -> Any:
+    """The scene, whose light is not gathered again."""
+    scene.integrator().corrections = corrections
+    return scene
+
+
+@pytest.fixture(scope="module")
+def gathered_once() -> Any:
+    return _scene("corrected", MEDIUM, _lamp())
+
+
+@pytest.fixture
+def scene(gathered_once: Any) -> Any:
+    """Of a lamp and a sky, not corrected yet."""
+    return _with(gathered_once, Corrections())
+
+
 def test_a_medium_without_absorption_is_invisible_in_uniform_light() -> None:
     """All walks bring 1, what the model lacks is corrected whole."""
-    gathered, corrected = (
-        _image(_scene(light, WHITE, {"sky": {"type": "constant"}}, hidden=False), 256)
-        for light in ("gathered", "corrected")
-    )
+    scene = _scene("corrected", WHITE, {"sky": {"type": "constant"}}, hidden=False)
+    gathered, corrected = (_image(_with(scene, each), 256) for each in (_Left(), Corrections()))
     assert np.abs(gathered - 1).max() > 0.1
     assert np.abs(corrected.mean(axis=(0, 1)) - 1).max() < 0.005
     assert np.abs(corrected - 1).max() < 0.03
 
 
-def test_it_has_the_mean_of_walks_through_a_rough_boundary_within_1_percent_where_the_model_is_smooth() -> None:
+def test_it_has_the_mean_of_walks_through_a_rough_boundary_within_1_percent_where_the_model_is_smooth(
+    scene: Any,
+) -> None:
     frosted = {**MEDIUM, "b": {"type": "roughdielectric", "alpha": 0.4, "int_ior": 1.4, "ext_ior": 1.0}}
-    walks = np.array([_image(_scene("precomputed", frosted, _lamp()), 2048, seed) for seed in (1, 2, 3, 4)])
+    walks = np.array([_image(_scene("precomputed", frosted, _lamp()), 1024, seed) for seed in (1, 2, 3, 4)])
     walked, error = walks.mean(axis=(0, 1, 2)), walks.mean(axis=(1, 2)).std(axis=0, ddof=1) / 2
-    gathered = _image(_scene("gathered", MEDIUM, _lamp()), 256).mean(axis=(0, 1))
+    gathered = _image(_with(scene, _Left()), 256).mean(axis=(0, 1))
     assert np.abs(gathered / walked - 1).max() > 0.05
     # the mean of one correction is known to 1.2 %
-    scene, means = _scene("corrected", frosted, _lamp()), []
-    for part in range(8):
-        scene.integrator().corrections = Corrections(part)
-        means.append(_image(scene, 256).mean(axis=(0, 1)))
+    rough = _scene("corrected", frosted, _lamp())
+    means = [_image(_with(rough, Corrections(part)), 64).mean(axis=(0, 1)) for part in range(6)]
     assert (np.abs(np.mean(means, axis=0) / walked - 1) < 0.01 + 4 * error / walked).all()
-    assert "corrected by 131072 walks" in scene.integrator().gathered[0]
+    assert "corrected by 131072 walks" in rough.integrator().gathered[0]
 
 
-def test_walks_are_added_for_an_image_of_more_samples_and_kept_for_one_of_fewer() -> None:
-    scene = _scene("corrected", MEDIUM, _lamp())
+def test_walks_are_added_for_an_image_of_more_samples_and_kept_for_one_of_fewer(scene: Any) -> None:
     walks = []
     for spp in (16, 2**14, 16):
         scene.integrator().prepare(scene, 144 * spp)
@@ -136,7 +157,9 @@ def test_walks_are_added_for_an_image_of_more_samples_and_kept_for_one_of_fewer(
     assert walks[1] == walks[2] == pytest.approx(144 * 2**14 / 8, rel=0.3)
 
 
-def test_walks_that_are_added_have_seeds_of_their_own_however_many_were_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_walks_that_are_added_have_seeds_of_their_own_however_many_were_lost(
+    scene: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from full_geometry.integrators import correction
 
     seeds = []
@@ -149,14 +172,17 @@ def test_walks_that_are_added_have_seeds_of_their_own_however_many_were_lost(mon
         )
 
     monkeypatch.setattr(correction, "residuals", few)
-    scene = _scene("corrected", MEDIUM, _lamp())
     for spp, launches in ((16, 2), (16, 2), (2**14, 4), (2**14, 4), (2**15, 8)):
         scene.integrator().prepare(scene, 144 * spp)
         assert len(seeds) == len(set(seeds)) == launches
 
 
-def test_light_is_corrected_anew_when_an_emitter_was_edited() -> None:
-    scene = _scene("corrected", MEDIUM, _lamp())
+def test_the_same_seed_gives_the_same_image(scene: Any) -> None:
+    one, two = (_image(_with(scene, Corrections()), 16, 7) for _ in range(2))
+    np.testing.assert_allclose(one, two, rtol=1e-4, atol=1e-5)
+
+
+def test_light_is_corrected_anew_when_an_emitter_was_edited(scene: Any) -> None:
     before = _image(scene, 16)
     parameters = mi.traverse(scene)
     parameters["lamp.emitter.radiance.value"] = 0.0
@@ -164,17 +190,11 @@ def test_light_is_corrected_anew_when_an_emitter_was_edited() -> None:
     preview = np.array(scene.integrator().preview(scene, scene.sensors()[0], 0, 16))
     assert scene.integrator().corrections.told() == [] and preview.mean() < 0.7 * before.mean()
     after = _image(scene, 16)
-    lights = {"sky": {"type": "constant", "radiance": 0.3}}
-    dark = {**_lamp(), **lights}
+    dark = _lamp()
     dark["lamp"]["emitter"]["radiance"] = 0.0
     fresh = _image(_scene("corrected", MEDIUM, dark), 16)
     assert after.mean() < 0.7 * before.mean()
     np.testing.assert_allclose(after.mean(axis=(0, 1)), fresh.mean(axis=(0, 1)), rtol=0.01)
-
-
-def test_the_same_seed_gives_the_same_image() -> None:
-    one, two = (_image(_scene("corrected", MEDIUM, _lamp()), 16, 7) for _ in range(2))
-    np.testing.assert_allclose(one, two, rtol=1e-4, atol=1e-5)
 
 
 def test_a_diffuse_surface_is_refused_by_name() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import mitsuba as mi
@@ -42,11 +43,16 @@ def _image(integrator: dict[str, Any], lights: dict[str, Any], hide: bool, spp: 
     return np.array(mi.render(scene, spp=spp, seed=1))
 
 
+@cache
+def _known(lights: str, hide: bool) -> np.ndarray:
+    return _image({"type": "path"}, LIGHTS[lights](), hide, 256)
+
+
 @pytest.mark.parametrize("hide", [True, False], ids=["hidden", "shown"])
 @pytest.mark.parametrize("lights", LIGHTS)
 @pytest.mark.parametrize("kind", INTEGRATORS)
 def test_hidden_emitters_and_alpha_are_those_of_the_path_tracer_of_mitsuba(kind: str, lights: str, hide: bool) -> None:
-    known = _image({"type": "path"}, LIGHTS[lights](), hide, 256)
+    known = _known(lights, hide)
     found = _image(INTEGRATORS[kind], LIGHTS[lights](), hide, 64)
     assert np.abs(found[:, :, 3] - known[:, :, 3]).max() < 0.35  # samples at edges
     assert np.abs(found[:, :, 3] - known[:, :, 3]).mean() < 0.01

@@ -26,7 +26,7 @@ def send(wait):
     time.sleep(wait)
     sent.append(time.monotonic())
     os.kill(os.getpid(), signal.SIGINT)
-for wait in (0.1, 1.5):
+for wait in (0.1, 0.8):
     threading.Thread(target=send, args=(wait,), daemon=True).start()
     try:
         mi.render(scene, spp=2**13).numpy()

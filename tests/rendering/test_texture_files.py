@@ -144,12 +144,14 @@ def test_colours_of_vertices_are_the_medium_of_the_bitmap_and_bytes_there_are_re
         painted(BYTES[0, 0])
 
 
+WALK, SAMPLED, GATHERED = {"type": "translucent_walk"}, {"type": "bssrdf"}, {"type": "bssrdf", "light": "gathered"}
+
+
 @pytest.mark.parametrize(
-    "integrator",
-    [{"type": "translucent_walk"}, {"type": "bssrdf"}, {"type": "bssrdf", "light": "gathered"}],
-    ids=["walk", "sampled", "gathered"],
-)
-@pytest.mark.parametrize(("parameter", "raw"), [("reflectance", False), ("mfp", True)])
+    ("integrator", "parameter", "raw"),
+    [(WALK, "reflectance", False), (WALK, "mfp", True), (SAMPLED, "reflectance", False), (SAMPLED, "mfp", True),
+     (GATHERED, "reflectance", False)],
+)  # fmt: skip
 def test_a_painted_object_looks_alike_by_bytes_and_by_floats(
     tmp_path: Path, integrator: dict, parameter: str, raw: bool
 ) -> None:

@@ -227,9 +227,8 @@ def test_precomputed_light_of_walks_has_less_variance_and_no_bias_beside_its_noi
 
 def test_corrected_light_has_a_fifth_of_the_bias_of_gathered_light_at_most() -> None:
     thin, models = {"sigma_s": 2.0, "sigma_a": 0.02}, ["better_dipole, gathered", "better_dipole, corrected"]
-    gathered, corrected = (
-        assess(scene(thin), models=models, flip=False, samples=512, exits=64).objects[0].way(name) for name in models
-    )
+    found = assess(scene(thin), models=models, flip=False, samples=512, exits=64).objects[0]
+    gathered, corrected = map(found.way, models)
     assert gathered.bias2 > 0.15**2
     assert np.sqrt(max(corrected.bias2 - 3 * corrected.bias2_error, 0)) < np.sqrt(gathered.bias2) / 5
     assert corrected.seconds > gathered.seconds  # by its walks
@@ -318,12 +317,11 @@ def _painted(*albedos: float) -> dict[str, Any]:
 
 def test_a_textured_object_is_assessed_by_the_ways_that_take_it() -> None:
     """A texture of one colour is as far from walks as its medium; others of two colours say what they refuse."""
-    quick = {**QUICK, "seconds": 1.0}
     ways = ["better_dipole", "neural_shape", "better_dipole, gathered"]
     medium = {"sigma_s": 9.5, "sigma_a": 0.5}
-    plain, one = (assess(scene(m), models=ways[:1], **quick).objects[0].way(ways[0]) for m in (medium, _painted(0.95)))
+    plain, one = (assess(scene(m), models=ways[:1], **QUICK).objects[0].way(ways[0]) for m in (medium, _painted(0.95)))
     assert abs(plain.ratio[0] - one.ratio[0]) < 4 * np.hypot(plain.ratio_error[0], one.ratio_error[0])
-    found = assess(scene(_painted(0.95, 0.5)), models=ways, **quick)
+    found = assess(scene(_painted(0.95, 0.5)), models=ways, **QUICK)
     two = [found.objects[0].way(way) for way in ways]
     assert not two[0].refusal and two[0].samples > 0
     assert "must be without textures for the model 'neural_shape'" in two[1].refusal
