@@ -97,7 +97,6 @@ class ForwardScatteringDipole(BSSRDF):
     Args:
         n_samples: quadrature nodes on each side, the knob between speed and accuracy.
         virtual_source: z_v = 4 A D ("classical"), 4 A D of Grosjean ("grosjean"), 2 A d_e ("directional").
-        radiance_scaling: False leaves 1/eta² out, as ports of the model do that multiply by T_12 T_21 alone.
     """
 
     name = "forward_scattering_dipole"
@@ -105,21 +104,14 @@ class ForwardScatteringDipole(BSSRDF):
     reciprocal = True
     source = "Frederickx and Dutré 2017, A forward scattering dipole model from a functional integral approximation"
 
-    def __init__(
-        self,
-        medium: Medium,
-        *,
-        n_samples: int = 16,
-        virtual_source: str = "classical",
-        radiance_scaling: bool = True,
-    ) -> None:
+    def __init__(self, medium: Medium, *, n_samples: int = 16, virtual_source: str = "classical") -> None:
         super().__init__(medium)
         if np.min(medium.g) < 0:
             raise ValueError(f"g must be >= 0 for the forward-scattering dipole, got {float(np.min(medium.g))!r}")
         if not (isinstance(n_samples, int) and 2 <= n_samples <= 1000):
             raise ValueError(f"n_samples must be an integer in [2, 1000], got {n_samples!r}")
         check_choice("virtual_source", virtual_source, VIRTUAL_SOURCES)
-        self.n_samples, self.virtual_source, self.radiance_scaling = n_samples, virtual_source, bool(radiance_scaling)
+        self.n_samples, self.virtual_source = n_samples, virtual_source
         m = medium.in_mfp()
         self._p = np.maximum(0.5 * m.sigma_s * (1 - m.g), 1e-12)
         self._absorption = m.sigma_a / self._p
@@ -128,9 +120,7 @@ class ForwardScatteringDipole(BSSRDF):
             D = (2 * m.sigma_a + m.sigma_s_prime) / (3 * m.sigma_t_prime**2)
         half_z_v = 2 * D if virtual_source != "directional" else 2.131 * D / np.sqrt(np.maximum(m.albedo_prime, 1e-20))
         self._z_v = 2 * boundary_A(m.eta) * half_z_v * self._p
-        self._scale = np.where(np.asarray(m.sigma_s) > 0, self._p**2, 0.0) / (4 * math.pi**2.5)
-        if self.radiance_scaling:
-            self._scale = self._scale / m.eta**2
+        self._scale = np.where(np.asarray(m.sigma_s) > 0, self._p**2, 0.0) / (4 * math.pi**2.5) / m.eta**2
 
     def G(self, q: Query) -> Real:
         q = q.in_float64()

@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.tables import in_markdown
 from figures.computing.contenders import VOLUMES, WALK, volume
-from figures.drawing.image_files import label
+from figures.drawing.image_grid import label
 from figures.parts.part import Params, Row
 from halfspace_sss.comparison.style import look
 

@@ -9,10 +9,10 @@ import numpy as np
 
 from benchmarks.head_and_leaf import LEAVES, make_head, write_painted
 from benchmarks.things import Staging, against_walks, lit_scene, shown, thing_parts, walked
+from figures.computing.contenders import NOTE
 from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, trained, training_of, weight_files, with_weights
-from figures.computing.references import NOTE
 from figures.computing.scans import prepare
-from figures.drawing.image_files import image_files, rows_of
+from figures.drawing.image_grid import image_files, rows_of
 from figures.parts.part import Part, Result, SceneDict, Task
 from full_geometry.learning.meshes import Box, box, make_shape, surface
 from halfspace_sss.physics.medium import Medium

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.things import Staging, against_walks, lit_scene, shown, thing_parts, walked
-from figures.computing.references import NOTE
+from figures.computing.contenders import NOTE
 from figures.computing.scans import BUNNY, MM_PER_UNIT
-from figures.drawing.image_files import image_files, rows_of
+from figures.drawing.image_grid import image_files, rows_of
 from figures.parts.part import Part, Result, SceneDict, Task
 from halfspace_sss.neural.universal import shipped_weights
 from halfspace_sss.provenance import check_folder

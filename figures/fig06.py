@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from figures.computing.contenders import NOTE, against, reference_image, reference_shot
 from figures.computing.images import Shot
 from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training_of, with_weights
-from figures.computing.references import NOTE, against, reference_image, reference_shot
 from figures.computing.scans import BUNNY, ENVIRONMENTS, environment, environment_file, prepare, scan_scene
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page

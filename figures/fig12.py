@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from figures.computing.contenders import reference_image
 from figures.computing.images import FLIP, Shot, compared, stops_of
 from figures.computing.learnt import shape_of
-from figures.computing.references import reference_image
 from figures.computing.scans import BUNNY, prepare, scan_scene
-from figures.drawing.image_files import image_files
+from figures.drawing.image_grid import image_files
 from figures.parts.part import Params, Part, Result, Task
 from halfspace_sss.neural.store import weights_in
 

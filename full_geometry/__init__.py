@@ -29,19 +29,8 @@ if TYPE_CHECKING:
 __all__ = [
     "Recipe", "errors", "frames", "inverse", "load", "object_of", "register", "trade", "train", "transport_of", "view",
 ]  # fmt: skip
-__getattr__, __dir__ = lazy_names(
-    __name__,
-    {
-        "Recipe": "learning.network_fitting",
-        "errors": "learning.model_errors",
-        "frames": "viewing.frames",
-        "inverse": "",
-        "load": "transport.storing",
-        "object_of": "learning.model_errors",
-        "register": "plugins",
-        "trade": "",
-        "train": "learning.training",
-        "transport_of": "learning.model_errors",
-        "view": "viewing.page",
-    },
-)
+__getattr__, __dir__ = lazy_names(__name__, {
+    "": ["inverse", "trade"], "learning.model_errors": ["errors", "object_of", "transport_of"], "plugins": ["register"],
+    "learning.network_fitting": ["Recipe"], "learning.training": ["train"], "transport.storing": ["load"],
+    "viewing.frames": ["frames"], "viewing.page": ["view"],
+})  # fmt: skip

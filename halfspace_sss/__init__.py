@@ -40,40 +40,13 @@ if TYPE_CHECKING:
 prefer_bundled_llvm()
 
 __all__ = [
-    "BSSRDF",
-    "Fibre",
-    "Instrument",
-    "Layers",
-    "Medium",
-    "Ring",
-    "bssrdf",
-    "curves",
-    "make_maps",
-    "materials",
-    "measure",
-    "models",
-    "neural",
-    "register_model",
-    "trace",
-]
+    "BSSRDF", "Fibre", "Instrument", "Layers", "Medium", "Ring", "bssrdf", "curves", "make_maps", "materials",
+    "measure", "models", "neural", "register_model", "trace",
+]  # fmt: skip
 
-__getattr__, __dir__ = lazy_names(
-    __name__,
-    {
-        "BSSRDF": "interface.model",
-        "Fibre": "tracing.instrument",
-        "Instrument": "tracing.instrument",
-        "Layers": "physics.layers",
-        "Medium": "physics.medium",
-        "Ring": "tracing.instrument",
-        "bssrdf": "registry",
-        "curves": "comparison.reflectance_curves",
-        "make_maps": "maps.map_store",
-        "materials": "",
-        "measure": "",
-        "models": "registry",
-        "neural": "",
-        "register_model": "registry",
-        "trace": "tracing.tracer",
-    },
-)
+__getattr__, __dir__ = lazy_names(__name__, {
+    "": ["materials", "measure", "neural"], "comparison.reflectance_curves": ["curves"], "interface.model": ["BSSRDF"],
+    "maps.map_store": ["make_maps"], "physics.layers": ["Layers"], "physics.medium": ["Medium"],
+    "registry": ["bssrdf", "models", "register_model"], "tracing.instrument": ["Fibre", "Instrument", "Ring"],
+    "tracing.tracer": ["trace"],
+})  # fmt: skip

@@ -6,16 +6,19 @@ import functools
 import importlib
 import sys
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 
-def lazy_names(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], object], Callable[[], list[str]]]:
+def lazy_names(
+    package: str, modules: Mapping[str, Iterable[str]]
+) -> tuple[Callable[[str], object], Callable[[], list[str]]]:
     """`__getattr__` and `__dir__` of a package.
 
     Args:
         package: its `__name__`.
-        homes: module within the package by public name; "" for a name that is itself a module of the package.
+        modules: public names by module within the package; "" for names that are themselves modules of the package.
     """
+    homes = {name: home for home, names in modules.items() for name in names}
 
     def get(name: str) -> object:
         if name not in homes:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from figures.computing.contenders import NOTE, against, reference_shot
 from figures.computing.images import Shot
 from figures.computing.learnt import (
     CHUNKS,
@@ -16,9 +17,8 @@ from figures.computing.learnt import (
     train_modelled,
     training_of,
 )
-from figures.computing.references import NOTE, against, reference_shot
 from figures.computing.scans import environment_file, prepare
-from figures.drawing.image_files import image_files
+from figures.drawing.image_grid import image_files
 from figures.fig01 import LIGHT, RESOLUTION, SIZES, TRUTH, VIEWS, View, foot, scene, shown
 from figures.fig01 import SPP as OURS_SPP
 from figures.modelling.objects import TISSUES

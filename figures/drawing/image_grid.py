@@ -1,4 +1,4 @@
-"""A figure of images as papers have it: a row for each scene, a column for each model, FLIP maps below."""
+"""A figure of images as papers have it, a row for each scene, a column for each model, FLIP maps below; its files."""
 
 from __future__ import annotations
 
@@ -14,9 +14,12 @@ from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import TextPath
 
+from figures.computing.contenders import VOLUMES, WALK
 from figures.computing.images import FLIP, Shot, absent
+from figures.drawing.page import page
+from figures.parts.part import Row
 from full_geometry.trade.image_differences import srgb
-from halfspace_sss.comparison.style import TEXT
+from halfspace_sss.comparison.style import TEXT, look, paper, saved
 
 GAP, ROW_GAP, TITLE, CAPTION, NAME = 0.035, 0.07, 0.17, 0.13, 0.16  # inches
 PALE, GREY = "#f5f5f5", "#8a8a8a"
@@ -174,3 +177,49 @@ def _title_size(labels: Sequence[str], cell: float) -> float:
 def _text_width(text: str, size: float, weight: str = "normal") -> float:
     """Points that a line of the figure's type takes."""
     return TextPath((0, 0), text, prop=FontProperties(size=size, weight=weight)).get_extents().width if text else 0.0
+
+
+# ---- Files ----
+
+
+def image_files(
+    figure: str,
+    title: str,
+    scenes: Mapping[str, Sequence[Shot]],
+    rows: Sequence[Row],
+    notes: str,
+    printed: Sequence[str] = (FLIP,),
+) -> dict[str, bytes | str]:
+    """The figure as PDF and PNG, the page to flip between the images, and the numbers as a table.
+
+    Args:
+        figure: its name.
+        title: of the page.
+        scenes: images of each scene, the reference first.
+        rows: of the table.
+        notes: below the images of the page.
+        printed: numbers below each image of the picture.
+    """
+    import pandas
+
+    with paper():
+        drawn = saved(image_grid(scenes, printed=printed))
+    files: dict[str, bytes | str] = {f"{figure}.{end}": data for end, data in drawn.items()}
+    files[f"{figure}.csv"] = pandas.DataFrame(rows).to_csv(index=False, lineterminator="\n")
+    files[f"{figure}.html"] = page(title, scenes, notes=notes)
+    return files
+
+
+def label(method: str) -> str:
+    """The name of a method as people read it."""
+    if method in VOLUMES:
+        kind, rr_depth = method.split()
+        return f"Mitsuba {kind}, roulette from {rr_depth}"
+    if method == WALK:
+        return "Our walk"
+    return "Neural half-space" if method == "neural" else look(method).label
+
+
+def rows_of(scenes: Mapping[str, Sequence[Shot]], key: str) -> list[Row]:
+    """Rows of the table of a figure: the numbers of each image but the references; `key` is what a scene is called."""
+    return [{key: name, "model": shot.label, **shot.numbers} for name, shots in scenes.items() for shot in shots[1:]]

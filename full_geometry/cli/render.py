@@ -162,7 +162,7 @@ def _image(
     from full_geometry.scenes.cross_denoising import cross_denoised
     from full_geometry.scenes.reference_store import Picture
     from full_geometry.trade.denoising import Denoiser
-    from halfspace_sss.locks import one_writer
+    from halfspace_sss.provenance import one_writer
 
     with one_writer(file):
         if images.frames and images.resume and _is_finished(way, file, which):

@@ -17,13 +17,5 @@ if TYPE_CHECKING:
 
 __all__ = ["MaterialFit", "FitSettings", "GivenView", "fit", "read_views"]
 
-__getattr__, __dir__ = lazy_names(
-    __name__,
-    {
-        "MaterialFit": "comparing",
-        "FitSettings": "comparing",
-        "fit": "fitting",
-        "GivenView": "views",
-        "read_views": "views",
-    },
-)
+MODULES = {"comparing": ["MaterialFit", "FitSettings"], "fitting": ["fit"], "views": ["GivenView", "read_views"]}
+__getattr__, __dir__ = lazy_names(__name__, MODULES)

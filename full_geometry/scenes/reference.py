@@ -29,8 +29,7 @@ from full_geometry.scenes.scene_files import first_cause
 from full_geometry.settings import AUTO, check_variant
 from full_geometry.surface.wrapped import surface_of
 from halfspace_sss.checks import check_count
-from halfspace_sss.locks import one_writer
-from halfspace_sss.provenance import check_folder, provenance
+from halfspace_sss.provenance import check_folder, one_writer, provenance
 
 FEWEST_PASSES = 8  # before the spread of the passes is trusted to stop a run
 SHARE = 4  # a growing pass has at most a quarter of the samples so far: enough passes for their spread, few launches

@@ -18,14 +18,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Assessment", "ObjectTrade", "TechniqueTrade", "assess", "recommend", "recommend_flat"]
 
-__getattr__, __dir__ = lazy_names(
-    __name__,
-    {
-        "Assessment": "results",
-        "ObjectTrade": "results",
-        "TechniqueTrade": "results",
-        "assess": "assessing",
-        "recommend": "advice",
-        "recommend_flat": "flat",
-    },
-)
+RESULTS = ["Assessment", "ObjectTrade", "TechniqueTrade"]
+MODULES = {"results": RESULTS, "assessing": ["assess"], "advice": ["recommend"], "flat": ["recommend_flat"]}
+__getattr__, __dir__ = lazy_names(__name__, MODULES)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from halfspace_sss.comparison.cell_energies import evaluated
+from halfspace_sss.comparison.model_errors import evaluated
 from halfspace_sss.comparison.truths import Truth, read_truths
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.measure.reflected_flux import reflectance_estimate

@@ -12,4 +12,4 @@ if TYPE_CHECKING:
 
 __all__ = ["MapGrid", "load_maps", "make_maps"]
 
-__getattr__, __dir__ = lazy_names(__name__, {"MapGrid": "grid", "load_maps": "map_store", "make_maps": "map_store"})
+__getattr__, __dir__ = lazy_names(__name__, {"grid": ["MapGrid"], "map_store": ["load_maps", "make_maps"]})

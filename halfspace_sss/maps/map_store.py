@@ -24,12 +24,11 @@ import numpy as np
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import as_count, check_count, check_interval
 from halfspace_sss.executors import completed
-from halfspace_sss.locks import one_writer
 from halfspace_sss.maps.grid import MapGrid, cell_edges, map_directions
 from halfspace_sss.maps.map_tracing import MapUnit, UnitResult, trace_unit
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import ProgressText
-from halfspace_sss.provenance import JsonDict, is_remote, naming, path_of, provenance
+from halfspace_sss.provenance import JsonDict, is_remote, naming, one_writer, path_of, provenance
 
 if TYPE_CHECKING:
     import xarray as xr

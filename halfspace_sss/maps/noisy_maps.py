@@ -28,7 +28,7 @@ from halfspace_sss.provenance import write_atomically
 from halfspace_sss.tracing.tallies import CellSums
 from halfspace_sss.tracing.walk import Scatter, WalkConstants, pass_seed, walk
 
-LANES = 32768  # of one launch, at most
+LANES, PER_LAUNCH = 32768, 256  # lanes and groups of one launch, at most
 FIRST_R = 0.02  # of min(L, mfp): smallest distance in the maps
 LEAST_ALBEDO = 1e-4  # G/albedo² of darker media is that of this one to 1e-4
 PILOT_LANES = 8  # of a group, one walk each
@@ -212,11 +212,9 @@ def trace_groups(
     grid: CellGrid,
     events: float,
     seed: tuple[int, ...],
-    *,
-    per_launch: int = 256,
     backend: str = "llvm",
 ) -> list[MapLaunch]:
-    """Launches of `per_launch` groups that together trace all of them, those of long walks side by side.
+    """Launches of `PER_LAUNCH` groups that together trace all of them, those of long walks side by side.
 
     Args:
         groups: media and directions.
@@ -225,7 +223,7 @@ def trace_groups(
         seed: seeds of the random numbers.
     """
     order = np.argsort((1 - groups.albedo) * (1 - groups.albedo * groups.g), kind="stable")
-    parts = [order[at : at + per_launch] for at in range(0, len(order), per_launch)]
+    parts = [order[at : at + PER_LAUNCH] for at in range(0, len(order), PER_LAUNCH)]
     return [
         MapLaunch(part, groups[part], grid, events * len(part) / len(groups), (*seed, k), backend)
         for k, part in enumerate(parts)

@@ -26,9 +26,8 @@ __all__ = ["MODELS", "Neural", "NeuralMaterial", "NeuralPaper", "train", "train_
 
 MODELS = [Neural, NeuralMaterial, NeuralPaper]
 
-_found, __dir__ = lazy_names(
-    __name__, {"train": "training.train_material", "train_universal": "training.train_universal"}
-)
+TRAININGS = {"training.train_material": ["train"], "training.train_universal": ["train_universal"]}
+_found, __dir__ = lazy_names(__name__, TRAININGS)
 
 
 def __getattr__(name: str) -> object:

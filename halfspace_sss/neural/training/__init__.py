@@ -13,6 +13,6 @@ if TYPE_CHECKING:
 
 __all__ = ["FAST", "STANDARD", "Fit", "MaterialRecipe", "UniversalRecipe", "train", "train_universal"]
 
-_MATERIAL = dict.fromkeys(("FAST", "STANDARD", "MaterialRecipe", "train"), "train_material")
-_UNIVERSAL = dict.fromkeys(("UniversalRecipe", "train_universal"), "train_universal")
-__getattr__, __dir__ = lazy_names(__name__, {"Fit": "fit", **_MATERIAL, **_UNIVERSAL})
+MATERIAL, UNIVERSAL = ["FAST", "STANDARD", "MaterialRecipe", "train"], ["UniversalRecipe", "train_universal"]
+MODULES = {"fit": ["Fit"], "train_material": MATERIAL, "train_universal": UNIVERSAL}
+__getattr__, __dir__ = lazy_names(__name__, MODULES)
