@@ -19,7 +19,13 @@ from full_geometry.integrators.walk_paths import FirstExits, LightVisitor, PathT
 from full_geometry.objects.inclusions import check_sensors
 from full_geometry.objects.objects import KnowsUnit, check_size, places_of, translucent_shapes
 from full_geometry.objects.small_emitters import SmallEmitters
-from full_geometry.precomputed.unscattered_light import UnscatteredLight, inside_cells_of, obstacle, unscattered_light
+from full_geometry.precomputed.unscattered_light import (
+    UnscatteredLight,
+    holds_scattered,
+    inside_cells_of,
+    obstacle,
+    unscattered_light,
+)
 from full_geometry.settings import OF_MITSUBA, WALK_LIGHTS, check_parameters
 from full_geometry.surface.textured import shown
 from full_geometry.surface.varying import equivalent
@@ -103,7 +109,7 @@ def _class(variant: str) -> type:
 
         def tracer(
             self, scene: mi.Scene, seed: int = 0, samples: int = 0, scored: bool = False,
-            light: UnscatteredLight | None = None,
+            light: UnscatteredLight | None = None, exits: bool = False,
         ) -> PathTracer:  # fmt: skip
             """What paths through a scene need; its objects are made ready once, its emitters may have been edited.
 
@@ -112,6 +118,7 @@ def _class(variant: str) -> type:
                 samples: of the image, by which that light has its rays; 0 leaves it to be sampled.
                 scored: whether derivatives are asked for, which leave light to be sampled.
                 light: that is known already.
+                exits: whether walks have to leave, so that scattered light is not precomputed.
             """
             # ---- objects and inner lights, made once for a scene
             self._prepared = _prepared(scene, self._prepared, self.mm_per_unit)
@@ -124,7 +131,8 @@ def _class(variant: str) -> type:
                     self._cells = media, inside_cells_of(media)
                 if light is None:
                     started, rays = clock(), min(max(samples // SAMPLES_PER_RAY, FEWEST_RAYS), MOST_RAYS)
-                    light = unscattered_light(scene, media, seed, self._cells[1], rays)
+                    ends = holds_scattered(media) and inner is None and self.max_depth == FOREVER and not exits
+                    light = unscattered_light(scene, media, seed, self._cells[1], rays, ends)
                     self.filling = clock() - started
                 connections, directions, straight = None, None, None
 
@@ -169,7 +177,7 @@ def _class(variant: str) -> type:
             with interruptible(), dr.suspend_grad():
                 seed = int(mi.UInt32(seed)[0])
                 samples = spp * int(dr.prod(sampled_size(sensor.film())))
-                _render(self.tracer(scene, seed, samples), sensor, seed, spp, keep)
+                _render(self.tracer(scene, seed, samples, exits=keep is not None), sensor, seed, spp, keep)
                 return sensor.film().develop() if develop else None
 
         def sample(

@@ -15,11 +15,13 @@ from typing import Any, NamedTuple
 import drjit as dr
 import mitsuba as mi
 
+from full_geometry.geometry.instances import shapes_of
 from full_geometry.geometry.points import lifted, opaque, sided
 from full_geometry.geometry.rounding import ray_from
 from full_geometry.geometry.sensors import past_emitters, shows_sky
 from full_geometry.objects.small_emitters import NARROW, WIDE, SmallEmitters
 from full_geometry.precomputed.forward_scattering import ForwardRun
+from full_geometry.precomputed.scattered_light import FEW, ONWARD
 from full_geometry.precomputed.unscattered_light import UnscatteredLight
 from full_geometry.walk.emission import emission, emitter_pdf, mis_weight, next_event, survival
 from full_geometry.walk.emitter_connections import (
@@ -65,6 +67,7 @@ class LightRecord:
     sighted: mi.Bool  # an emitter was sampled at the last event, and only boundaries of index 1 were passed since
     scattered: mi.Bool  # whether a vertex has scattered into a solid angle: delta lights then are no longer hidden
     precomputed: mi.Bool  # the ray's emission is in the unscattered light of the last event, or in the mirror image
+    known: mi.Bool  # light that comes by objects alone has been found precomputed
     slopes: Score | tuple[()] = ()  # where derivatives are asked for, see `walk.scores`
     run: ForwardRun | tuple[()] = ()  # where precomputed light has met forward events
 
@@ -147,7 +150,9 @@ class LightVisitor:
         # ---- emitters whose light arrives unscattered: L += throughput ∫ p(w.w') L_0(x, w') dw'
         if self.unscattered is not None:
             counts = self.media.counts(walk.object, walk.order + 1)
-            L = walk.weight * self.unscattered.light(self.media, event)
+            if self.unscattered.scattered is not None:
+                return self._all_light(walk, record, event)
+            L = walk.weight * self.unscattered.light(self.media, event)[0]
             if self.forward:
                 share = dr.select(record.precomputed, record.run.onward(event.along).share, 1)
                 run = ForwardRun(share, mi.Vector3f(event.along), mi.Spectrum(event.m.g), mi.Bool(True))
@@ -178,6 +183,21 @@ class LightVisitor:
         departure = Departure(event.p, event.along, record.departure.ahead, walk.object)
         return walk, replace(record, departure=departure)
 
+    def _all_light(self, walk: Walk, record: LightRecord, event: Event) -> tuple[Walk, LightRecord]:
+        """Precomputed light of an event: unscattered, and of a few events on all, with which the walk ends."""
+        # ---- L += throughput ∫ p L_0 dw', at the last event ∫ p (L_0 + L_s) dw'
+        last = ~record.known & (walk.order + 1 >= FEW)
+        light, held = self.unscattered.light(self.media, event, last)
+        last &= held
+        L = record.L + dr.select(record.known, 0, walk.weight * light)
+        record = replace(record, L=L, known=record.known | last, precomputed=mi.Bool(True))
+
+        # ---- a share goes on, for light by way of other surfaces
+        if not self.others:
+            return replace(walk, alive=walk.alive & ~last), record
+        alive = walk.alive & (~last | (walk.rng.next_float32() < ONWARD))
+        return replace(walk, alive=alive, weight=dr.select(last, walk.weight / ONWARD, walk.weight)), record
+
     def _connect(self, walk: Walk, record: LightRecord, event: Event) -> tuple[Walk, LightRecord, Event]:
         # L += throughput Σ connections of a light subpath with this event
         light, slopes, rng = self.connections.light(event, walk.rng)
@@ -202,6 +222,11 @@ class LightVisitor:
         return walk, replace(record, L=record.L + left * light)
 
     @property
+    def others(self) -> bool:
+        """Whether the scene has other surfaces than objects."""
+        return len(shapes_of(self.scene, self.media.shown)) > len(self.media.objects)
+
+    @property
     def forward(self) -> bool:
         """Whether precomputed light has met forward events."""
         return self.unscattered is not None and self.unscattered.forward
@@ -210,7 +235,8 @@ class LightVisitor:
         """The share of the emission met next that is not precomputed."""
         if self.unscattered is None:
             return mi.Spectrum(1)
-        return dr.select(record.precomputed, record.run.share if self.forward else mi.Spectrum(0), mi.Spectrum(1))
+        share = record.run.share if self.forward else mi.Spectrum(0)
+        return dr.select(record.precomputed | record.known, share, mi.Spectrum(1))
 
     def surface(
         self, walk: Walk, record: LightRecord, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32
@@ -382,7 +408,7 @@ def start_record(lanes: int, scored: bool = False, forward: bool = False) -> Lig
         directed=full(mi.Bool, False),
         departure=Departure(mi.Point3f(point), along, mi.Vector3f(along), full(mi.Int32, 0)),
         sighted=full(mi.Bool, False), scattered=full(mi.Bool, False),
-        precomputed=full(mi.Bool, False), slopes=Score.sums(lanes) if scored else (),
+        precomputed=full(mi.Bool, False), known=full(mi.Bool, False), slopes=Score.sums(lanes) if scored else (),
         run=ForwardRun.none(lanes) if forward else (),
     )  # fmt: skip
 
@@ -537,12 +563,13 @@ class PathTracer:
         walk, light, media, rng = p.walk, p.light, self.visitor.media, p.walk.rng
         k, bsdf = media.draw(si, walk.d, rng)
         translucent, near = k >= 0, dr.maximum(k, 0)
+        light = replace(light, known=light.known & translucent)
         si = media.seen(si, k, walk.d)
         mute = mi.Bool(False)
         if media.objects:
             bsdf = dr.select(translucent, media.boundary_pointer(near), bsdf)
             mute = translucent & ((p.depth == self.begins_at) | ~media.row("reflects", near))
-        lit = ~mute
+        lit = ~(mute | light.known)
         behind = None if media.inner is None else self._behind(walk, si, bsdf, translucent)
         if behind is not None:
             bsdf, lit = behind.bsdf, lit & ~behind.unlit

@@ -28,7 +28,7 @@ that: phase functions are cut after q_2 = g² instead, and MOST_TRUNCATED bounds
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import zip_longest
@@ -38,12 +38,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.geometry.instances import InstanceTransform, corners, ends_of
-from full_geometry.geometry.light_points import uniform_entries
-from full_geometry.geometry.points import EntrySample, cosine_above, cosine_density, lift, opaque, sided
-from full_geometry.geometry.rounding import blocked, ray_from
+from full_geometry.geometry.instances import corners, ends_of
+from full_geometry.geometry.points import EntrySample, opaque, sided
 from full_geometry.precomputed.forward_scattering import kept_forward, quadratic_part, split_extinction, truncated
 from full_geometry.precomputed.inside_cells import RIDGE, CellIndex, InsideCells, cell_edge
+from full_geometry.precomputed.lit_points import bend, entries, lit_points, multiples, to_world
+from full_geometry.precomputed.scattered_light import ScatteredLight
 from full_geometry.precomputed.transport_matrix import R_2
 from full_geometry.walk.media import WalkMedia
 from full_geometry.walk.random_walk import Event, fly, free_path, pick, sample_bsdf, turn
@@ -56,10 +56,9 @@ DEPTHS = 3.6, 9.0  # mean free paths below the surface, at which cells are coars
 ALONG, FORWARD_ALONG = 6, 1  # points on a segment of a ray; forward events part it into many
 FEWEST_POINTS, MOST_POINTS = 2**14, 2**18  # of the surface that find its cells, of all and at once
 MOST_INTEGER = 2**15 - 1  # of 16 bits, for a direction of 1
-BY_COSINE = 0.25  # of the directions to emitters
 MOST_TRUNCATED = 0.5  # abs(g) of media that vary or have textures, above which three coefficients are too few
+FEWEST_PATHS = 2**14  # of light that scatters, from each of many objects
 ROULETTE = 0.1  # part of its light below which a reflected ray may end
-R_4 = (0.8566748838545029, 0.7338918566271260, 0.6287067210378087, 0.5385972572236101)  # Roberts 2018, four dimensions
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +70,8 @@ class UnscatteredLight:
         fluence: of each slot and channel ∫ phi (1, x, y, z) dx, x from the centre of the cell by its edge.
         directions: of each slot and channel f_x, f_y, f_z, M_xx, M_yy, M_xy, M_xz, M_yz in 16 bits each; None where all
             media scatter evenly.
+        scattered: of each slot and channel the same as `fluence` of light that has scattered, see `scattered_light`;
+            None where that is left to walks.
         tables: by the number of an object, where its bricks begin, their corner, 1/h and counts.
         forward: whether it has met forward events, see `forward_scattering`.
     """
@@ -80,9 +81,16 @@ class UnscatteredLight:
     directions: mi.UInt32 | None
     tables: dict[str, Any]
     forward: bool
+    scattered: mi.Float | None = None
 
-    def light(self, media: WalkMedia, event: Event) -> mi.Spectrum:
-        """Unscattered light that an event of a walk scatters on along it, per weight of the walk."""
+    def light(self, media: WalkMedia, event: Event, last: mi.Bool | bool = False) -> tuple[mi.Spectrum, mi.Bool]:
+        """Light that an event of a walk scatters on along it, per weight of the walk, and whether a cell holds it.
+
+        Args:
+            media: the objects.
+            event: of the walk.
+            last: whether scattered light counts too.
+        """
         # ---- find the cell of the event
         at = {key: dr.gather(type(t), t, media.place_of(event.object)) for key, t in self.tables.items()}
         x = mi.Point3f((event.p - at["low"]) * at["scale"])
@@ -91,10 +99,13 @@ class UnscatteredLight:
         # ---- evaluate the fluence there, phi(y) = (D_0 + 12 / (1 + RIDGE) D.y) / edge³
         n, y, inverse = len(mi.Spectrum(0)), y * (12 / (1 + RIDGE)), inverse * at["scale"]
         rows = [dr.gather(mi.Vector4f, self.fluence, mi.UInt32(slot * n + c), held) for c in range(n)]
+        if self.scattered is not None:
+            rows = [row + dr.gather(mi.Vector4f, self.scattered, mi.UInt32(slot * n + c), held & last)
+                    for c, row in enumerate(rows)]  # fmt: skip
         phi = mi.Spectrum([v.x + v.y * y.x + v.z * y.y + v.w * y.z for v in rows])
         phi *= inverse * dr.square(inverse) / (4 * dr.pi)
         if self.directions is None:
-            return phi
+            return phi, held
 
         # ---- q_0 + 3 q_1 w.f + 5/2 q_2 (3 w^T M w - 1), w^T M w by the trace of 1
         x, y, z = event.along.x, event.along.y, event.along.z
@@ -107,11 +118,11 @@ class UnscatteredLight:
             q_0, q_1, q_2 = quadratic_part(g) if self.forward else truncated(g)
             J = q_0 + 3 * q_1 * (a.x * x + a.y * y + a.z * z) + 2.5 * q_2 * (3 * squares - 1)
             result.append(phi[c] * J)
-        return mi.Spectrum(result)
+        return mi.Spectrum(result), held
 
 
 def unscattered_light(
-    scene: mi.Scene, media: WalkMedia, seed: int, cells: list[InsideCells], rays: int
+    scene: mi.Scene, media: WalkMedia, seed: int, cells: list[InsideCells], rays: int, scattered: bool = False
 ) -> UnscatteredLight:
     """Unscattered light of the emitters of a scene.
 
@@ -121,6 +132,7 @@ def unscattered_light(
         seed: whole number.
         cells: of the objects, from `inside_cells_of`.
         rays: of light, for each object.
+        scattered: whether light that has scattered is precomputed too.
     """
     # ---- trace light into the cells of each object, fit its fluence and directions, and put all into one table
     n = len(mi.Spectrum(0))
@@ -148,8 +160,37 @@ def unscattered_light(
     index = CellIndex(_joined(bricks), _joined(slots))
     light = _joined(fluence), _joined(directions) if directional else None
     dr.make_opaque(tables, index, light)
+    found = UnscatteredLight(index, *light, tables, forward(media))
+    if scattered:
+        found = replace(found, scattered=_scattered(scene, media, seed, found, cells, rays))
     dr.sync_thread()  # callers time this
-    return UnscatteredLight(index, *light, tables, forward(media))
+    return found
+
+
+def _scattered(
+    scene: mi.Scene, media: WalkMedia, seed: int, light: UnscatteredLight, cells: list[InsideCells], rays: int
+) -> mi.Float:
+    """The fit of scattered light in the cells of all objects."""
+    # ---- paths from all objects, which pass from one to another
+    n = 4 * len(mi.Spectrum(0))
+    D = dr.zeros(mi.Float, n * sum(grid.slots for grid in cells))
+    dr.eval(D)
+    paths = ScatteredLight(scene, media, light.index, light.tables, D)
+    for k in range(len(cells)):
+        paths.trace(k, max(rays // len(cells), FEWEST_PATHS), seed)
+
+    # ---- the fit of each
+    parts, first = [], 0
+    for grid in cells:
+        part = dr.gather(mi.Float, D, first + dr.arange(mi.UInt32, n * grid.slots))
+        first += n * grid.slots
+        dr.eval(part)
+        grid.share(part, n, moments=True)
+        grid.fit(part)
+        parts.append(part)
+    result = _joined(parts)
+    dr.make_opaque(result)
+    return result
 
 
 def _joined(parts: list) -> Any:
@@ -198,6 +239,11 @@ def obstacle(media: WalkMedia) -> str:
     return ""
 
 
+def holds_scattered(media: WalkMedia) -> bool:
+    """Whether cells can hold scattered light: media are even in direction and in space, and not of each walk."""
+    return not (media.varies or media.carried) and not any(np.any(spec.medium.g) for spec in media.specs)
+
+
 def inside_cells_of(media: WalkMedia) -> list[InsideCells]:
     """The cells of all objects."""
     results = []
@@ -211,7 +257,7 @@ def inside_cells_of(media: WalkMedia) -> list[InsideCells]:
 def _grid(media: WalkMedia, k: int) -> tuple[tuple[np.ndarray, np.ndarray], float, tuple[float, float]]:
     """The box of object k, the edge of its cells, and the depths beyond which they are coarse and end, scene units."""
     kind = media.instance_table.kind[k]
-    low, high = ends_of(corners(media.objects[kind].scene.bbox(), _to_world(media, k)[None]))
+    low, high = ends_of(corners(media.objects[kind].scene.bbox(), to_world(media, k)[None]))
     edge, extinction = FORWARD_EDGE if forward(media) else EDGE, _extinction(media, kind)
     depths = (np.inf, np.inf) if media.varies else tuple(depth / float(np.min(extinction)) for depth in DEPTHS)
     box, (area, volume) = (low[0], high[0]), _extent(media, k)
@@ -236,18 +282,7 @@ def _surface_points(media: WalkMedia, k: int, area: float, density: float) -> It
     width = math.ceil(n / parts)
     for part in range(parts):
         u = (dr.arange(mi.Float, width) + 0.5) * opaque(1 / (width * parts)) + opaque(part / parts)
-        yield _entries(media, k, [dr.minimum(u, 1 - 2**-24), *_multiples(R_2, (0.5, 0.5), width, part * width)])
-
-
-def _multiples(roots: tuple[float, ...], shift: Iterable[float], width: int, first: int = 0) -> list[mi.Float]:
-    """Multiples of roots from `first` on, shifted, in [0, 1): in whole numbers, which float32 would round."""
-    result = []
-    for root, s in zip(roots, shift):
-        step = int(root * 2**32)
-        start = (int(s * 2**32) + first * step) % 2**32
-        step, start = (dr.opaque(mi.UInt32, v) for v in (step, start))
-        result.append(mi.Float((dr.arange(mi.UInt32, width) * step + start) >> 8) * 2**-24)
-    return result
+        yield entries(media, k, [dr.minimum(u, 1 - 2**-24), *multiples(R_2, (0.5, 0.5), width, part * width)])
 
 
 def _extinction(media: WalkMedia, kind: int) -> np.ndarray:
@@ -259,23 +294,6 @@ def _extinction(media: WalkMedia, kind: int) -> np.ndarray:
 def forward(media: WalkMedia) -> bool:
     """Whether rays of light go on through forward events: some medium is uneven in direction, none in space."""
     return not (media.varies or media.carried) and any(np.any(spec.medium.g) for spec in media.specs)
-
-
-def _to_world(media: WalkMedia, k: int) -> np.ndarray:
-    """Where object k stands: the matrix of an instance."""
-    kind = int(media.instance_table.kind[k])
-    return media.instance_table.to_world(kind)[k - int(media.instance_table.first[kind])]
-
-
-def _entries(media: WalkMedia, k: int, u: list[mi.Float]) -> EntrySample:
-    """Points uniform over the surface of object k, in an instance over that in its group; the weight is 1 / density."""
-    kind = int(media.instance_table.kind[k])
-    entries = uniform_entries(media.objects[kind], u[0], mi.Point2f(u[1], u[2]))
-    if media.instance_table.groups[kind] is None:
-        return entries
-    M = _to_world(media, k)
-    columns = [[mi.Vector3f(*(opaque(v) for v in column)) for column in m[:3].T] for m in (M, np.linalg.inv(M))]
-    return InstanceTransform(*columns, mi.Float(0)).entry_to_world(entries)
 
 
 @dataclass
@@ -317,72 +335,20 @@ class _Rays:
     forward: bool
 
     def enter(self, number: int, rays: int, seed: int) -> _Ray:
-        """Rays of emitters at points of the surface, refracted into the object.
-
-        By the camera's paths, light is L cos(w, n_s) f / |d.n_s| for each radiance along d; a ray has the flux
-
-            L cos(w, n_s) (f cos / pdf)(w -> d) |d.n| / |d.n_s|,
-
-        over the density of the point and of w, n_s the shading normal.
-        """
+        """Rays of emitters at points of the surface, refracted into the object."""
         media, rng = self.media, generator(mi, rays, pass_seed(seed, number))
-
-        # ---- points in order along the faces, with a sample of the emitters each
-        shift = np.random.default_rng([seed, number]).random(5)
-        u = [(dr.arange(mi.Float, rays) + opaque(shift[4])) / opaque(rays), *_multiples(R_4, shift, rays)]
-        at = _entries(media, number, [dr.minimum(u[0], 1 - 2**-24), u[1], u[2]])
-        si = dr.zeros(mi.SurfaceInteraction3f, rays)
-        si.p, si.n, si.sh_frame = mi.Point3f(at.p), mi.Normal3f(at.n), mi.Frame3f(at.n_out)
-        w, light = self._incident(si, mi.Point2f(u[3], u[4]), rng)
-        si.wi = si.to_local(w)
-        si = lift(si, w)
-
-        # ---- refraction
+        si, flux = lit_points(self.scene, media, number, rays, (seed, number), rng)
         bs, value = sample_bsdf(media.boundary(self.k), si, rng, _only(mi.BSDFFlags.Transmission))
         d, _ = sided(si, bs.wo)
-        cosine = mi.Frame3f.cos_theta(si.wi)
-        bend = dr.abs(dr.dot(d, si.n)) / dr.maximum(dr.abs(mi.Frame3f.cos_theta(bs.wo)), 1e-6)
-        enters = (bs.pdf > 0) & (dr.dot(si.n, w) > 0) & (cosine > 0) & (dr.dot(d, si.n) < 0)
-        flux = dr.select(enters, light * value * (cosine * bend * at.weight / opaque(rays)), 0)
+        enters = (bs.pdf > 0) & (dr.dot(d, si.n) < 0)
+        flux = dr.select(enters, flux * value * bend(si, bs.wo, d), 0)
         enters &= dr.max(flux) > 0
         T = dr.full(mi.Spectrum, 1, rays)
         channel = dr.minimum(mi.UInt32(rng.next_float32() * len(T)), len(T) - 1)
         return _Ray(
-            o=mi.Point3f(at.p), d=d, off=media.clear(self.k, si.n, d), flux=mi.Spectrum(flux), T=T,
+            o=mi.Point3f(si.p), d=d, off=media.clear(self.k, si.n, d), flux=mi.Spectrum(flux), T=T,
             entered=dr.max(flux), channel=channel, density=mi.Spectrum(T), alive=mi.Bool(enters), rng=rng,
         )  # fmt: skip
-
-    def _incident(self, si: mi.SurfaceInteraction3f, u: mi.Point2f, rng: mi.PCG32) -> tuple[mi.Vector3f, mi.Spectrum]:
-        """A direction w to an emitter, and the light from there over its density.
-
-        A share of them is drawn by the cosine, for lamps so near that those of the emitters miss them (balance
-        heuristic over one sample): L / ((1 - BY_COSINE) p_emitter + BY_COSINE p_cosine).
-        """
-        scene, instance_scene = self.scene, self.media.instance_scene
-
-        # ---- by the emitters, L without its density; delta lights have no other technique
-        ds, light = scene.sample_emitter_direction(si, u, False)
-        shadow = instance_scene.ray_to_emitter(si, ds, self.media.row("rounding", self.k))
-        delta, active = mi.Bool(ds.delta), ds.pdf > 0
-        light = dr.select(active & ~blocked(scene, shadow, active), light * ds.pdf, 0)
-
-        # ---- by the cosine
-        w, _ = cosine_above(si.sh_frame.n, si.n, u)
-        drawn = rng.next_float32() < BY_COSINE
-        met = instance_scene.intersect(
-            scene, ray_from(si, w, self.media.row("rounding", self.k)), mi.RayFlags.All, active=drawn
-        )
-        emitter = met.emitter(scene, drawn)
-        found = drawn & (emitter != None)  # noqa: E711
-        there = mi.DirectionSample3f(scene, met, si)
-
-        # ---- balance heuristic over one sample: L / ((1 - b) p_emitter + b p_cosine), b = BY_COSINE
-        p_emitter = dr.select(drawn, scene.pdf_emitter_direction(si, there, found), ds.pdf)
-        w = mi.Vector3f(dr.select(drawn, w, ds.d))
-        p_cosine = dr.select(delta & ~drawn, 0, cosine_density(si.sh_frame.n, si.n, w))
-        light = dr.select(drawn, dr.select(found, emitter.eval(met, found), 0), light)
-        density = (1 - BY_COSINE) * p_emitter + BY_COSINE * p_cosine
-        return w, dr.select(density > 0, light / dr.maximum(density, 1e-30), 0)
 
     def segment(self, ray: _Ray) -> _Ray:
         """Light along a ray as far as the surface, and its reflection there."""

@@ -201,7 +201,7 @@ class Visitor(Protocol):
     """What is recorded of a walk. Each method returns the walk, whose random numbers it may use up, and its record."""
 
     def event(self, walk: Walk, record: Record, event: Event) -> tuple[Walk, Record]:
-        """At a scattering event, after `walk.order` others."""
+        """At a scattering event, after `walk.order` others; it may end the walk."""
 
     def boundary(self, walk: Walk, record: Record, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[Walk, Record]:
         """At the boundary from inside, where the walk may leave if `active`."""
@@ -278,7 +278,7 @@ class Walker:
         if self.roulette_from > 1:  # before, walks without weight alone end
             scale = dr.select(order < self.roulette_from, dr.largest(mi.Float), scale)
         survives, weight = roulette(weight, scale, rng.next_float32())
-        alive = survives & (order <= media.row("most", walk.object)) & media.box.contains(event.p)
+        alive = walk.alive & survives & (order <= media.row("most", walk.object)) & media.box.contains(event.p)
         walk = replace(walk, o=event.p, d=d, off=media.behind(walk.object, d), weight=weight, density=density,
                        order=order, alive=alive, object=dr.select(alive, walk.object, OUTSIDE))  # fmt: skip
         return walk, record

@@ -1,0 +1,187 @@
+"""Light that has scattered inside objects, precomputed in the cells of unscattered light.
+
+A walk from the camera that looks up unscattered light L_0 alone goes on until it leaves: most of its noise and time lie
+in its later events. Light L_s that comes to a point by way of other events, or of other objects, is smooth there. Paths
+from the emitters bring it to the cells, once for an image, and at event FEW of a stay in an object a walk adds
+
+    weight ∫ p(w.w') (L_0 + L_s)(x, w') dw'
+
+and ends. Events before that one add L_0, and what they leave is met by chance, so that each path is found once: one of
+fewer than FEW events since the camera's path entered at the last of them, all others at event FEW.
+
+A path of light begins as rays of unscattered light do, but may also be reflected there. It walks through objects and
+between them. Each of its events adds the weight with which it arrives over sigma_s, the estimate of ∫ L_s dw dx by
+collisions, but for those that L_0 holds: the first event of a path that has not left the object it began at. Light by
+way of other surfaces than objects is left to paths from the camera, of which a share goes on for that.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import mitsuba as mi
+
+from full_geometry.geometry.points import opaque, sided
+from full_geometry.precomputed.lit_points import bend, lit_points
+from full_geometry.walk.media import WalkMedia
+from full_geometry.walk.random_walk import OUTSIDE, Crossing, Event, Walk, Walker, below, sample_bsdf, start_walk
+from halfspace_sss.tracing.walk import generator, pass_seed
+
+if TYPE_CHECKING:
+    from full_geometry.precomputed.inside_cells import CellIndex
+
+FEW = 3  # dragon of marble: 2, 3 and 5 have 20, 13 and 7 times less variance x time, ever less of the noise of cells
+LANES = 2**14
+GPU_FACTOR = 4  # as many times lanes on CUDA
+MOST_ADJOINT = 4.0
+AT_ONCE, CANDIDATES = 2**17, 2  # paths, and points with light for each of them
+ONWARD = 0.25  # share of walks that go on beyond FEW events where other surfaces than objects may send light
+
+
+@dataclass
+class LightPath:
+    """What a walk from an emitter carries.
+
+    Args:
+        flux: where it began.
+        direct: whether it has not left the object since.
+    """
+
+    flux: mi.Spectrum
+    direct: mi.Bool
+
+
+@dataclass(frozen=True, eq=False)
+class ScatteredLight:
+    """Paths from emitters that add ∫ L_s x_j dx dw to cells at their events.
+
+    Args:
+        scene, media: of Mitsuba, and its objects.
+        index: of the cells of all objects.
+        tables: by the number of an object, as of `UnscatteredLight`.
+        D: of each slot and channel ∫ L_s (1, x, y, z) dx dw, x from the centre of the cell by its edge.
+    """
+
+    scene: mi.Scene
+    media: WalkMedia
+    index: CellIndex
+    tables: dict[str, Any]
+    D: mi.Float
+
+    def trace(self, k: int, number: int, seed: int) -> None:
+        """Add the light of so many paths that begin on object k, or a few more."""
+        parts = math.ceil(number / AT_ONCE)
+        for part in range(parts):
+            self._trace(self._starts(k, math.ceil(number / parts), parts, (seed, k, part)), (seed, k, part))
+
+    def _starts(self, k: int, number: int, parts: int, seed: tuple[int, ...]) -> tuple:
+        """Where paths of about equal flux begin: o, d, off, object, whether there is light, and the path."""
+        # ---- points of the surface with a sample of the emitters, refracted or reflected there: flux *= f cos / p
+        many = CANDIDATES * number
+        rng = generator(mi, many, pass_seed(*seed, 1))
+        si, flux = lit_points(self.scene, self.media, k, many, (*seed, 1), rng)
+        bs, value = sample_bsdf(self.media.boundary(k), si, rng, mi.BSDFContext(mi.TransportMode.Importance))
+        d, _ = sided(si, bs.wo)
+        enters = dr.dot(d, si.n) < 0
+        flux = dr.select(bs.pdf > 0, flux * value * bend(si, bs.wo, d), 0)
+        o, off = self.media.depart(si, d, enters)
+        size, u = dr.max(dr.abs(flux)), rng.next_float32()
+        dr.eval(o, d, off, enters, flux, size, u)
+
+        # ---- of these a few, each with the probability of its flux, in order along the faces
+        ends = dr.cumsum(dr.float64_array_t(mi.Float)(size))
+        total = float(ends[-1])
+        at = (dr.arange(type(ends), number) + float(u[0])) * (total / number)
+        which = dr.binary_search(0, many - 1, lambda i: dr.gather(type(ends), ends, i) < at)
+        o, d, off, enters, flux, size = (dr.gather(type(v), v, which) for v in (o, d, off, enters, flux, size))
+        flux = dr.select(size > 0, flux * (opaque(total / (number * parts)) / dr.maximum(size, 1e-30)), 0)
+        return o, d, off, dr.select(enters, mi.Int32(k), OUTSIDE), size > 0, LightPath(flux, enters)
+
+    def _trace(self, starts: tuple, seed: tuple[int, ...]) -> None:
+        """Walk from so many starts; lanes take those of index, index + lanes, ... until none is left."""
+        dr.eval(starts)
+        number, n = dr.width(starts[0]), len(mi.Spectrum(0))
+        lanes = min(LANES * GPU_FACTOR if mi.variant().startswith("cuda") else LANES, number)
+        total, step = (dr.opaque(mi.UInt32, v) for v in (number, lanes))
+        walker = Walker(self.media, self)
+
+        def begin(index: mi.UInt32, rng: mi.PCG32) -> tuple[Walk, LightPath]:
+            known = index < total
+            o, d, off, k, alive, path = (dr.gather(type(v), v, index, known) for v in starts)
+            channel = below(n, rng.next_float32())
+            return replace(start_walk(o, d, rng), off=off, object=k, alive=alive & known, channel=channel), path
+
+        def renew(walk: Walk, index: mi.UInt32, path: LightPath) -> tuple[Walk, mi.UInt32, LightPath]:
+            walk, path = begin(index + step, walk.rng)
+            return walk, index + step, path
+
+        def body(walk: Walk, index: mi.UInt32, path: LightPath) -> tuple[Walk, mi.UInt32, LightPath]:
+            inside = walk.alive & (walk.object >= 0)
+            walk, path = dr.if_stmt((walk, path), inside, walker.step, _same, label="inside")
+            (walk,) = dr.if_stmt((walk,), walk.alive & (walk.object < 0), self._outside, _same, label="outside")
+            return dr.if_stmt((walk, index, path), ~walk.alive, renew, _same, label="renew")
+
+        index = dr.arange(mi.UInt32, lanes)
+        walk, path = begin(index, generator(mi, lanes, pass_seed(*seed, 2)))
+        dr.while_loop((walk, index, path), lambda walk, index, path: index < total, body, label="paths of light")
+        dr.eval(self.D)
+
+    def _outside(self, walk: Walk) -> tuple[Walk]:
+        """A ray between objects, as far as another or the same one, which reflects it or lets it in."""
+        media = self.media
+        si = media.instance_scene.intersect(self.scene, mi.Ray3f(walk.o, walk.d), mi.RayFlags.All)
+        k = media.index_of(si, si.is_valid())
+        met = k >= 0
+        k = dr.maximum(k, 0)
+        si = media.seen(si, k, walk.d)
+        bs, value = sample_bsdf(media.boundary(k), si, walk.rng)
+        d, _ = sided(si, bs.wo)
+        enters = dr.dot(d, si.n) < 0
+        o, off = media.depart(si, d, enters)
+        alive = met & (bs.pdf > 0) & (dr.dot(si.n, walk.d) < 0)
+        weight = walk.weight * value * adjoint(si, walk.d, d)
+        return (replace(walk, o=o, d=d, off=off, alive=alive, order=mi.UInt32(0) & walk.order,
+                        object=dr.select(alive & enters, k, OUTSIDE), weight=weight,
+                        scale=walk.scale * dr.square(bs.eta)),)  # fmt: skip
+
+    # ---- visitor of walks
+
+    def event(self, walk: Walk, path: LightPath, event: Event) -> tuple[Walk, LightPath]:
+        """Add what arrives."""
+        at = {key: dr.gather(type(t), t, self.media.place_of(event.object)) for key, t in self.tables.items()}
+        x = mi.Point3f((event.p - at["low"]) * at["scale"])
+        slot, y, _, held = self.index.find(x, at["first"], at["counts"], ~path.direct | (walk.order > 0))
+        # refraction by the camera's paths has 1 / scale, flux has not
+        light = path.flux * walk.weight * (walk.scale / dr.maximum(event.m.sigma_s, 1e-30))
+        n = len(light)
+        for c in range(n):
+            dr.scatter_add(self.D, mi.Vector4f(1, y.x, y.y, y.z) * light[c], mi.UInt32(slot * n + c), held)
+        return walk, path
+
+    def boundary(
+        self, walk: Walk, path: LightPath, si: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> tuple[Walk, LightPath]:
+        return walk, path
+
+    def surface(
+        self, walk: Walk, path: LightPath, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32
+    ) -> tuple[Walk, LightPath]:
+        return walk, path
+
+    def crossing(self, walk: Walk, path: LightPath, crossing: Crossing) -> tuple[Walk, LightPath]:
+        weight = dr.select(crossing.leaves, walk.weight * adjoint(crossing.si, crossing.along, walk.d), walk.weight)
+        return replace(walk, weight=weight), replace(path, direct=path.direct & ~crossing.leaves)
+
+
+def adjoint(si: mi.SurfaceInteraction3f, along: mi.Vector3f, d: mi.Vector3f) -> mi.Float:
+    """What light from `along` into d has beyond the camera's paths: |along.n_s| |d.n| / (|along.n| |d.n_s|)."""
+    n, n_s = si.n, si.sh_frame.n
+    of_light, of_camera = dr.dot(along, n_s) * dr.dot(d, n), dr.dot(along, n) * dr.dot(d, n_s)
+    return dr.minimum(dr.abs(of_light) / dr.maximum(dr.abs(of_camera), 1e-6), MOST_ADJOINT)
+
+
+def _same(*state: object) -> tuple:
+    return state
