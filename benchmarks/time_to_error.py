@@ -1,9 +1,9 @@
 """CPU seconds from a fresh scene to a total error of denoised path tracing, at kernels that are known.
 
-Passes grow, and whenever the samples have grown by half the halves are denoised and compared
-(`full_geometry.scenes.cross_denoising`), for pixels and for means over blocks of 8 x 8. No reference is rendered: the
-error is estimated without bias from the halves, but for the bias of precomputed light, below .3 %. The time of raw path
-tracing follows from its variance. Ways are walks with precomputed light and Mitsuba's `volpathmis`.
+Passes grow. Whenever the samples have grown by what the last errors ask for, by half at least, the halves are denoised
+and compared (`full_geometry.scenes.cross_denoising`), for pixels and for means over blocks of 8 x 8. No reference is
+rendered: the error is estimated without bias from the halves, but for the bias of precomputed light, below .3 %. The
+time of raw path tracing follows from its variance. Ways are walks with precomputed light and Mitsuba's `volpathmis`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from full_geometry.scenes.reference_store import Reference
 from full_geometry.trade.denoising import Denoiser
 
 FEWEST_PASSES = 8
-GROWTH, SHARE, LARGEST_PASS = 1.5, 8, 64  # of samples between errors, and of passes
+GROWTH, MOST_GROWTH = 1.5, 4.0  # of samples between errors
+SHARE, LARGEST_PASS = 8, 64  # of passes
 
 
 @dataclass(frozen=True)
@@ -67,18 +68,20 @@ def _row(case: LitObject, way: str, how: ErrorsWanted, folder: Path) -> Row:
     for spp in (1, 2, 4, 8, 16, 32):
         image_of_pass(compiled, spp, how.seed)
     scene, started, seed = lit_scene(case, way, how.size, folder), time.process_time(), how.seed + 1
-    found, last = None, 0
+    found, wanted = None, 0.0
     while True:
         done = found.spp if found else 0
         spp = min(2 ** (max(done // SHARE, 1).bit_length() - 1), LARGEST_PASS)
         image = image_of_pass(scene, spp, seed)
         found = (found or Reference.empty(image.shape, {}, halves=True)).add(image, spp, 0.0)
         seconds, seed = time.process_time() - started, seed + 1
-        if found.passes < FEWEST_PASSES or (found.spp < GROWTH * last and seconds < how.most):
+        if found.passes < FEWEST_PASSES or (found.spp < wanted and seconds < how.most):
             continue
-        errors, last = _errors(found, denoise), found.spp
+        errors = _errors(found, denoise)
+        over = max(errors["pixels"] / how.pixels, errors["blocks"] / how.blocks)
+        wanted = found.spp * min(max(over**2, GROWTH), MOST_GROWTH)
         seconds = time.process_time() - started
-        reached = errors["pixels"] <= how.pixels and errors["blocks"] <= how.blocks
+        reached = over <= 1
         if reached or seconds > how.most:
             break
     raw = max(errors["raw pixels"] / how.pixels, errors["raw blocks"] / how.blocks) ** 2 * seconds

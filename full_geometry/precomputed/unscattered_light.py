@@ -57,7 +57,7 @@ ALONG, FORWARD_ALONG = 6, 1  # points on a segment of a ray; forward events part
 FEWEST_POINTS, MOST_POINTS = 2**14, 2**18  # of the surface that find its cells, of all and at once
 MOST_INTEGER = 2**15 - 1  # of 16 bits, for a direction of 1
 MOST_TRUNCATED = 0.5  # abs(g) of media that vary or have textures, above which three coefficients are too few
-FEWEST_PATHS = 2**14  # of light that scatters, from each of many objects
+FEWEST_PATHS = 2**14  # of scattered light, from each object
 ROULETTE = 0.1  # part of its light below which a reflected ray may end
 
 
@@ -122,7 +122,7 @@ class UnscatteredLight:
 
 
 def unscattered_light(
-    scene: mi.Scene, media: WalkMedia, seed: int, cells: list[InsideCells], rays: int, scattered: bool = False
+    scene: mi.Scene, media: WalkMedia, seed: int, cells: list[InsideCells], rays: int, paths: int = 0
 ) -> UnscatteredLight:
     """Unscattered light of the emitters of a scene.
 
@@ -132,7 +132,7 @@ def unscattered_light(
         seed: whole number.
         cells: of the objects, from `inside_cells_of`.
         rays: of light, for each object.
-        scattered: whether light that has scattered is precomputed too.
+        paths: of scattered light, all objects together; 0 leaves that to walks.
     """
     # ---- trace light into the cells of each object, fit its fluence and directions, and put all into one table
     n = len(mi.Spectrum(0))
@@ -161,23 +161,23 @@ def unscattered_light(
     light = _joined(fluence), _joined(directions) if directional else None
     dr.make_opaque(tables, index, light)
     found = UnscatteredLight(index, *light, tables, forward(media))
-    if scattered:
-        found = replace(found, scattered=_scattered(scene, media, seed, found, cells, rays))
+    if paths:
+        found = replace(found, scattered=_scattered(scene, media, seed, found, cells, paths))
     dr.sync_thread()  # callers time this
     return found
 
 
 def _scattered(
-    scene: mi.Scene, media: WalkMedia, seed: int, light: UnscatteredLight, cells: list[InsideCells], rays: int
+    scene: mi.Scene, media: WalkMedia, seed: int, light: UnscatteredLight, cells: list[InsideCells], paths: int
 ) -> mi.Float:
     """The fit of scattered light in the cells of all objects."""
     # ---- paths from all objects, which pass from one to another
     n = 4 * len(mi.Spectrum(0))
     D = dr.zeros(mi.Float, n * sum(grid.slots for grid in cells))
     dr.eval(D)
-    paths = ScatteredLight(scene, media, light.index, light.tables, D)
+    tracer = ScatteredLight(scene, media, light.index, light.tables, D)
     for k in range(len(cells)):
-        paths.trace(k, max(rays // len(cells), FEWEST_PATHS), seed)
+        tracer.trace(k, max(paths // len(cells), FEWEST_PATHS), seed)
 
     # ---- the fit of each
     parts, first = [], 0

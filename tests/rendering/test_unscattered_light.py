@@ -293,7 +293,7 @@ def test_light_of_a_window_has_a_fraction_of_the_noise_of_sampled_light() -> Non
     for how in ("precomputed", "sampled"):
         scene = _scene(how, MEDIUM, sky={"type": "envmap", "bitmap": mi.Bitmap(sky)})
         noise.append(np.var([mi.render(scene, spp=64, seed=k) for k in range(6)], axis=0).sum())
-    assert noise[0] < 0.2 * noise[1]
+    assert noise[0] < 0.05 * noise[1]  # .06 if walks went on beyond their third event
 
 
 def test_the_same_seed_gives_the_same_picture_and_another_seed_other_light() -> None:
