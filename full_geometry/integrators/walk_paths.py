@@ -560,10 +560,9 @@ class PathTracer:
     def _bounce(self, p: CameraPath, si: mi.SurfaceInteraction3f) -> CameraPath:
         """A surface met from outside: next-event estimation, BSDF sampling, Russian roulette, the way on or in."""
         # ---- what masks leave: the boundary of object k or another BSDF
-        walk, light, media, rng = p.walk, p.light, self.visitor.media, p.walk.rng
+        walk, media, rng = p.walk, self.visitor.media, p.walk.rng
         k, bsdf = media.draw(si, walk.d, rng)
-        translucent, near = k >= 0, dr.maximum(k, 0)
-        light = replace(light, known=light.known & translucent)
+        translucent, near, light = k >= 0, dr.maximum(k, 0), replace(p.light, known=p.light.known & (k >= 0))
         si = media.seen(si, k, walk.d)
         mute = mi.Bool(False)
         if media.objects:
