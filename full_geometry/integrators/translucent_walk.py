@@ -68,8 +68,8 @@ def _class(variant: str) -> type:
         `hide_emitters` (false), `connection_share` (0.5; probability of a connection with a small emitter from a
         scattering event near the boundary, 0 leaves all light to chance), `blur` (1; scale of the cones over
         which delta lights are spread where no strategy reaches them: less has less bias and more noise, 0 leaves that
-        light out), `light` ("auto"; "precomputed" finds light that arrives unscattered on a grid, see
-        `unscattered_light`, which has 2.5 to 15 times less variance in the same time and a bias of less than .3 %;
+        light out), `light` ("auto"; "precomputed" finds light inside on a grid, see `unscattered_light`
+        and `scattered_light`, which has 2.5 to 15 times less variance in the same time and a bias of less than .3 %;
         "sampled" meets it by chance and by connections, without that bias; "auto" precomputes it where that is
         possible and there is more than an even sky, and samples it for derivatives), `layers` (false; true adds the
         channels emission.R, .G and .B to the image: emitters that the camera sees at once and, with precomputed light,

@@ -23,8 +23,8 @@ def lit_points(
 ) -> tuple[mi.SurfaceInteraction3f, mi.Spectrum]:
     """Points in order along the faces of object k, as a direction w to an emitter sees them, and their flux.
 
-    By the camera's paths, light is L cos(w, n_s) f / |d.n_s| for each radiance along d; behind the boundary a ray has
-    the flux
+    Paths from the camera find the light L cos(w, n_s) f / |d.n_s| for each radiance along d; behind the boundary a ray
+    has the flux
 
         L cos(w, n_s) (f cos / pdf)(w -> d) |d.n| / |d.n_s|,
 

@@ -12,7 +12,7 @@ fewer than FEW events since the camera's path entered at the last of them, all o
 A path of light begins as rays of unscattered light do, but may also be reflected there. It walks through objects and
 between them. Each of its events adds the weight with which it arrives over sigma_s, the estimate of ∫ L_s dw dx by
 collisions, but for those that L_0 holds: the first event of a path that has not left the object it began at. Light by
-way of other surfaces than objects is left to paths from the camera, of which a share goes on for that.
+way of other surfaces than objects is left to paths from the camera: a share of them goes on for that.
 """
 
 from __future__ import annotations
