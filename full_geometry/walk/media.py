@@ -94,7 +94,7 @@ class InclusionTable:
 
         # ---- what is around each: the smallest holder comes last and stays
         around, lights, result = np.full(len(instance_table), -1), {}, _largest_first(result, holders)
-        priorities = Priorities.of(scene, result, holders, len(own), groups)
+        priorities = Priorities.of(scene, result, holders, objects, groups)
         holding, held = np.zeros(len(own), dtype=bool), np.zeros(len(instance_table), dtype=bool)
         for inclusion in result:
             number = inclusion.object if inclusion.object < len(own) else -1

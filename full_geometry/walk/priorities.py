@@ -17,7 +17,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from full_geometry.geometry.instances import Group, InstanceTable, shapes_of
-from full_geometry.geometry.shape import name_of, pointer_numbers
+from full_geometry.geometry.shape import Geometry, name_of, pointer_numbers
 from full_geometry.objects.inclusions import Inclusion
 from full_geometry.surface.translucent import DIELECTRICS, boundary_of, is_smooth_boundary, with_index
 from full_geometry.surface.wrapped import surface_of
@@ -62,19 +62,20 @@ class Priorities:
 
     @classmethod
     def of(
-        cls, scene: mi.Scene, result: list[Inclusion], holders: InstanceTable, objects: int, groups: list[Group]
-    ) -> Priorities | None:
+        cls, scene: mi.Scene, result: list[Inclusion], holders: InstanceTable, objects: list[Geometry],
+        groups: list[Group],
+    ) -> Priorities | None:  # fmt: skip
         """The groups of a scene; None where nothing overlaps and nothing has a priority.
 
         Args:
             scene: of Mitsuba.
             result: what lies inside of what, the smallest holder last.
             holders: objects, then glass.
-            objects: number of the former.
+            objects: that are translucent, by shape.
             groups: that instances in the scene show.
 
         Raises:
-            ValueError: a group has more than MOST things, glass that is no dielectric, or a delta light.
+            ValueError: a group has more than MOST things, an open one, glass that is no dielectric, or a delta light.
         """
         # ---- which members hold or overlap each other
         first = {id(shape): int(number) for shape, number in zip(holders.shapes, holders.first)}
@@ -102,8 +103,8 @@ class Priorities:
         order = {k: (priority[k], len(inside[k]), listed[id(holders.shapes[kind])], k)
                  for k, kind in enumerate(holders.kind)}  # fmt: skip
         members = [sorted(np.flatnonzero(label == group).tolist(), key=order.get) for group in sorted(needed)]
-        _check(result, holders, members)
-        return cls._of(holders, objects, members, boundaries, eta)
+        _check(result, holders, members, objects)
+        return cls._of(holders, int(holders.first[len(objects)]), members, boundaries, eta)
 
     @classmethod
     def _of(
@@ -173,7 +174,7 @@ def _index(boundary: mi.BSDF) -> float:
     return float(np.max(np.array(boundary.eta if is_smooth_boundary(boundary) else mi.traverse(boundary)["eta"])))
 
 
-def _check(result: list[Inclusion], holders: InstanceTable, members: list[list[int]]) -> None:
+def _check(result: list[Inclusion], holders: InstanceTable, members: list[list[int]], objects: list[Geometry]) -> None:
     name = {k: name_of(holders.shapes[holders.kind[k]]) for group in members for k in group}
     for group in members:
         if len(group) > MOST:
@@ -181,6 +182,9 @@ def _check(result: list[Inclusion], holders: InstanceTable, members: list[list[i
                 f"at most {MOST} refracting shapes may overlap or hold each other where some have a priority, got "
                 f"{len(group)}, the shape {name[group[0]]} among them"
             )
+    for kind, obj in enumerate(objects):
+        if not obj.closed and not name.keys().isdisjoint(holders.numbers(kind)):
+            raise ValueError(f"objects that overlap or have a priority must be closed, got object {obj.name}")
     for inclusion in result:
         if isinstance(inclusion.node, mi.Emitter) and inclusion.object in name:
             raise ValueError(

@@ -166,10 +166,12 @@ COATED = {"type": "principled", "spec_trans": 1.0}
         (lambda: {"b": _ball(1.0, (0.5, 0, 0), bsdf=CREAM), **POINT}, "delta light must not stand .* got .*'lamp' in"),
         (lambda: {"b": _ball(1.0, (0.5, 0, 0), bsdf=COATED)}, "must be a dielectric or .* got the Principled of .*'b'"),
         (lambda: _copies(0.3, 0.5), "at most 2 refracting shapes may overlap .* got 3"),
+        (lambda: {"b": {"type": "cylinder", "p1": [4, 0, 0], "radius": 0.4, "bsdf": CREAM}}, "be closed, got .* 'b'"),
         (lambda: {"b": _ball(1.0, (-0.5, 0, 0), bsdf=CREAM)}, "surfaces must be apart by more than .* got the shape"),
     ],
-    ids=["delta light", "principled", "too many", "coplanar"],
+    ids=["delta light", "principled", "too many", "open", "coplanar"],
 )  # fmt: skip
+@pytest.mark.filterwarnings("ignore:object .* is not closed")
 def test_overlaps_that_cannot_be_known_are_refused_by_name(
     of: Callable[[], dict[str, Any]], wanted: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
