@@ -53,7 +53,7 @@ from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
-QUICK, CHUNKS = Recipe(width=24, depth=2, batch=1024, chunk=2**14, reuse=4), 12
+QUICK, CHUNKS = Recipe(width=24, depth=2, batch=1024, chunk=2**14, reuse=4), 9
 FEW = replace(QUICK, chunk=2**12)
 WAX = Medium([0.95, 0.8, 0.6], [0.05, 0.2, 0.4], 0.0, 1.4)
 

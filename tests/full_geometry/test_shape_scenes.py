@@ -18,6 +18,7 @@ from figures import app as cli  # noqa: E402
 from full_geometry.learning import model_errors  # noqa: E402
 from full_geometry.scenes.scene_files import load_scene  # noqa: E402
 from full_geometry.settings import Settings  # noqa: E402
+from full_geometry.transport import any_shape  # noqa: E402
 from full_geometry.transport.models import lookup, model_names  # noqa: E402
 from full_geometry.transport.prepare import make_objects  # noqa: E402
 
@@ -76,6 +77,13 @@ def test_channels_differ_as_their_media_do() -> None:
     assert np.isfinite(each).all() and each[0] > 1.2 * each[1] > 1.2 * each[2] > 0
 
 
+@pytest.fixture
+def uncalibrated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No walks for the light that leaves, which warnings come before."""
+    monkeypatch.setattr(any_shape, "calibrated", lambda model: model)
+
+
+@pytest.mark.usefixtures("uncalibrated")
 @pytest.mark.parametrize(
     ("ball", "surface", "words"),
     [
@@ -95,12 +103,14 @@ def test_it_warns_by_name_and_number_out_of_its_range(ball: dict, surface: dict,
     assert any(re.search(words, str(w.message)) for w in caught)
 
 
+@pytest.mark.usefixtures("uncalibrated")
 def test_it_warns_of_a_clear_object_by_its_mean_chord() -> None:
     """4/3 of the radius of 3: in grapefruit juice it was 1.13 of walks under a lamp, without a word."""
     with pytest.warns(UserWarning, match="object 'ball' is clear for neural_shape.*mean chord is 2.6, 2.6, 2.6 transp"):
         make_objects(load_scene(scene(sigma_s=0.6, sigma_a=0.05)), Settings())
 
 
+@pytest.mark.usefixtures("uncalibrated")
 def test_within_its_range_it_says_nothing() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -91,8 +91,10 @@ def test_reciprocity_is_kept_or_broken_as_declared(name, medium, queries):
         assert np.abs(back / np.where(relevant, there, 1) - 1)[relevant].max() > 0.01
 
 
-@pytest.mark.parametrize("precision", [np.float32, np.float64])
-@pytest.mark.parametrize("library", ["numpy", "torch", "drjit"])
+@pytest.mark.parametrize(
+    ("library", "precision"),
+    [("numpy", np.float32), *((library, kind) for library in ("torch", "drjit") for kind in (np.float32, np.float64))],
+)
 def test_every_array_library_and_precision_gives_the_same_value(name, medium, queries, library, precision):
     query = [x.astype(precision) for x in queries(500, medium)]
     model = halfspace_sss.bssrdf(name, medium)

@@ -178,7 +178,7 @@ def test_a_killed_fit_of_textures_goes_on_with_the_same_bits_and_writes_a_scene(
     mi.Bitmap(np.array(mi.render(open_scene(path), spp=64, seed=9)) * 1.1).write(str(tmp_path / "b.exr"))
     (tmp_path / "views.json").write_text(json.dumps({"views": [{"image": "b.exr"}]}))
     arguments = ["fit", str(path), "--images", str(tmp_path / "views.json"), "--parameter", "albedo,sigma_t"]
-    arguments += ["--steps", "4", "--spp", "64"]
+    arguments += ["--steps", "4", "--spp", "16"]
     whole = CliRunner().invoke(cli.app, [*arguments, "--out", str(tmp_path / "whole")])
     assert whole.exit_code == 0, whole.output
 
@@ -186,7 +186,7 @@ def test_a_killed_fit_of_textures_goes_on_with_the_same_bits_and_writes_a_scene(
         if done == 3:
             raise KeyboardInterrupt
 
-    how = {"settings": inverse.FitSettings(steps=4, spp=64), "work": tmp_path / "work"}
+    how = {"settings": inverse.FitSettings(steps=4, spp=16), "work": tmp_path / "work"}
     with pytest.raises(KeyboardInterrupt):
         inverse.fit(path, read_views(tmp_path / "views.json"), ("albedo", "sigma_t"), progress=kill, **how)
     rest = CliRunner().invoke(cli.app, [*arguments, "--out", str(tmp_path / "rest"), "--work", str(tmp_path / "work")])

@@ -27,7 +27,7 @@ def _lamps() -> dict[str, Any]:
 
 
 LIGHTS: dict[str, Callable[[], dict[str, Any]]] = {
-    "lamps": _lamps, "sky": lambda: {"sky": {"type": "constant", "radiance": 0.5}},
+    "lamps": _lamps,
     "lamps before a sky": lambda: {**_lamps(), "wall": {"type": "constant", "radiance": 0.5}},
 }  # fmt: skip
 

@@ -100,8 +100,7 @@ def test_the_h_function_used_here_has_its_published_value():
     assert H(1.0, 1.0) == pytest.approx(2.907810529, abs=1e-8)
 
 
-@pytest.mark.parametrize("albedo", [0.2, 0.9, 0.995])
-@pytest.mark.parametrize("mu_i", [1.0, 0.3, 0.05])
+@pytest.mark.parametrize(("albedo", "mu_i"), [(0.2, 1.0), (0.2, 0.05), (0.9, 0.3), (0.995, 1.0), (0.995, 0.05)])
 def test_matched_isotropic_reflectance_is_chandrasekhars(albedo, mu_i):
     R = trace(Medium.from_albedo(albedo, 3.0, 0.0, 1.0), mu_i, 400_000, 103).reflectance()
     assert R.standard_error < 7e-4
