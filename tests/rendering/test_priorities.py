@@ -156,6 +156,14 @@ def test_the_later_of_equal_priorities_wins() -> None:
     assert np.abs(image() - image(priority=1.0)).max() > 0.01
 
 
+def test_a_priority_of_an_object_inside_another_gives_its_index_another_meaning_and_no_more() -> None:
+    def image(**seed: float) -> np.ndarray:
+        seeds = {"wax": _ball(1.0, bsdf=JELLY), "seed": _ball(0.6, (0.1, 0, 0.2), bsdf={**CREAM, **seed})}
+        return np.array(mi.render(_view(seeds), spp=16, seed=1))
+
+    np.testing.assert_allclose(image(eta=1.2), image(eta=1.2 * 1.4, priority=1.0), rtol=1e-5)
+
+
 POINT = {"lamp": {"type": "point", "position": [0.7, 0, 0]}}
 COATED = {"type": "principled", "spec_trans": 1.0}
 
