@@ -94,15 +94,16 @@ def _row(case: LitObject, way: str, how: ErrorsWanted, folder: Path) -> Row:
 
 def _errors(found: Reference, denoise: Denoise) -> dict[str, float]:
     """Relative errors of pixels and blocks, denoised and raw; infinite where the image is not above its noise."""
-    halves, variance = Halves.of(found, denoise), found.variance[..., :3]
-    mean, s, result = found.mean[..., :3], halves.share, {}
+    mixed, mean, variance = Halves.of(found, denoise).mixed(), found.mean[..., :3], found.variance[..., :3]
+    result = {}
     for name, size in (("pixels", 1), ("blocks", BLOCK)):
-        A, B, V_A, V_B, D_A, D_B = (_means(x, size) for x in halves)
-        means = Halves(A, B, V_A / size**2, V_B / size**2, D_A, D_B)
-        squared, noise = means.squared(s)
-        whole = np.square(_means(mean, size)).sum() - _means(variance, size).sum() / size**2
+        means = mixed.means(size)
+        squared, noise = means.squared()
+        # of the halves: cells of precomputed light share their noise among pixels
+        raw = variance.sum() if size == 1 else 0.25 * np.square(means.A - means.B).sum()
         # sum L², an estimate, falls to 0 and below where noise hides the image
-        for key, square in ((name, max(squared.sum(), noise)), (f"raw {name}", _means(variance, size).sum() / size**2)):
+        whole = np.square(_means(mean, size)).sum() - raw
+        for key, square in ((name, max(squared.sum(), noise)), (f"raw {name}", raw)):
             result[key] = float(np.sqrt(square / whole)) if whole > 0 else np.inf
     return result
 

@@ -5,11 +5,15 @@ D a denoiser, B has no bias and is independent of D(A):
 
     E[(D(A) - B)²] = e_A² + V_B,    e_A² = E[(D(A) - L)²].
 
-So P = (1 - s) D(A) + s B and Q = (1 - s) D(B) + s A have the errors (1 - s)² e_A² + s² V_B and (1 - s)² e_B² + s² V_A,
-which s = e² / (e² + V), of the sums over the image, makes least. The image (P + Q) / 2, which comes to L with the
-samples as the denoiser gives way, has the mean squared error
+So s = e² / (e² + V), of the sums over the image, makes the error of (1 - s) D(A) + s B least. Noise falls in means over
+pixels, the bias of a denoiser hardly does. A share of its own is therefore that of coarse differences G (B - D(A)), G a
+Gaussian filter:
 
-    e² = E[(P - L)² + (Q - L)²] / 2 - E[(P - Q)²] / 4,
+    P = D(A) + K (B - D(A)),    Q = D(B) + K (A - D(B)),    K = s + (s_coarse - s) G.
+
+The image (P + Q) / 2, which comes to L with the samples as the denoiser gives way, has the mean squared error
+
+    e² = E[(P - B)² + (Q - A)² + N² - (A - B - N)²] / 2 - E[(P - Q)²] / 4,    N = K (A - B),
 
 with the bias of the denoiser in it. A bias of what is denoised, as that of precomputed light, is not in it. Rousselle,
 Knaus and Zwicker (2012) hold the halves of a render to each other.
@@ -22,9 +26,11 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 from full_geometry.scenes.reference_store import Reference
 
+COARSE = 3.0  # pixels, standard deviation of the filter
 Denoise = Callable[[np.ndarray], np.ndarray]  # an image (H, W, channels) -> its colours without noise (H, W, 3)
 
 
@@ -73,25 +79,50 @@ class Halves(NamedTuple):
         A, B = found.half, (spp * found.mean - n * found.half) / (spp - n)
         return cls(A[..., :3], B[..., :3], variance * (spp / n), variance * (spp / (spp - n)), denoise(A), denoise(B))
 
-    @property
-    def share(self) -> float:
-        """The share s of the noisy halves beside the denoised ones."""
-        e, V = max(float(np.sum(self.held())), 0.0), float((self.V_A + self.V_B).sum())
-        return e / (e + V) if e + V > 0 else 0.0
-
     def held(self) -> tuple[np.ndarray, np.ndarray]:
         """Estimates of e_A² and e_B² of the pixels, (H, W, 3): each denoised half held to the other."""
         return (self.D_A - self.B) ** 2 - self.V_B, (self.D_B - self.A) ** 2 - self.V_A
 
-    def mixed(self, s: float) -> tuple[np.ndarray, np.ndarray]:
-        """P and Q."""
-        return (1 - s) * self.D_A + s * self.B, (1 - s) * self.D_B + s * self.A
+    def mixed(self) -> Mixed:
+        """P, Q and N, by the shares of the noisy halves that make errors least."""
+        # ---- differences from the denoised halves, and those of the noise, which cells of light share among pixels
+        A, B, noise = self.B - self.D_A, self.A - self.D_B, self.A - self.B
+        coarse = [gaussian_filter(x, (COARSE, COARSE, 0)) for x in (A, B, noise)]
+        s, s_coarse = (_share(*parts) for parts in ((A, B, noise), coarse))
 
-    def squared(self, s: float) -> tuple[np.ndarray, float]:
+        # ---- K of each
+        P, Q, N = (s * x + (s_coarse - s) * low for x, low in zip((A, B, noise), coarse))
+        return Mixed(self.D_A + P, self.D_B + Q, N, self.A, self.B)
+
+
+class Mixed(NamedTuple):
+    """Halves with their shares of noise, (H, W, 3), as in the head of this module."""
+
+    P: np.ndarray
+    Q: np.ndarray
+    N: np.ndarray
+    A: np.ndarray
+    B: np.ndarray
+
+    def means(self, size: int) -> Mixed:
+        """Over blocks of `size` x `size` pixels; those at the ends that are not whole are left out."""
+        n, m = (length // size for length in self.P.shape[:2])
+        return Mixed(*(x[: n * size, : m * size].reshape(n, size, m, size, -1).mean(axis=(1, 3)) for x in self))
+
+    def squared(self) -> tuple[np.ndarray, float]:
         """Estimates of e² of the pixels, (H, W, 3), and the part of their sum that is noise, not bias."""
-        (e_A, e_B), (P, Q), V = self.held(), self.mixed(s), self.V_A + self.V_B
-        noise = 0.25 * ((1 - s) ** 2 * np.square(self.D_A - self.D_B).sum() + s**2 * V.sum())
-        return 0.5 * ((1 - s) ** 2 * (e_A + e_B) + s**2 * V) - 0.25 * (P - Q) ** 2, float(noise)
+        P, Q, N, A, B = self
+        apart = (P - Q) ** 2
+        result = 0.5 * ((P - B) ** 2 + (Q - A) ** 2 + N**2 - (A - B - N) ** 2) - 0.25 * apart
+        # P - Q + N is of the denoised halves alone
+        return result, float(0.25 * (np.square(P - Q + N) + N**2).sum())
+
+
+def _share(A: np.ndarray, B: np.ndarray, noise: np.ndarray) -> float:
+    """The share s of noisy halves, for differences of each denoised half from the other and of the noisy ones."""
+    V = float(np.square(noise).sum())
+    e = max(float(np.square(A).sum() + np.square(B).sum()) - V, 0.0)
+    return e / (e + V) if e + V > 0 else 0.0
 
 
 def cross_denoised(found: Reference, denoise: Denoise) -> Denoised:
@@ -104,11 +135,10 @@ def cross_denoised(found: Reference, denoise: Denoise) -> Denoised:
     if found.half is None or found.passes < 2:
         return Denoised(denoise(found.mean), math.inf, math.inf)
     halves = Halves.of(found, denoise)
-    s = halves.share
-    P, Q = halves.mixed(s)
-    squared, noise = halves.squared(s)
+    mixed = halves.mixed()
+    squared, noise = mixed.squared()
     squared = squared.sum(axis=2).ravel()
     whole = max(float(np.square(found.mean[..., :3]).sum() - found.variance[..., :3].sum()), 1e-30)
     error = math.sqrt(max(float(squared.sum()), noise) / whole)
     spread = math.sqrt(squared.size) * float(squared.std()) / whole
-    return Denoised(0.5 * (P + Q), error, spread / (2 * max(error, math.sqrt(spread), 1e-15)))
+    return Denoised(0.5 * (mixed.P + mixed.Q), error, spread / (2 * max(error, math.sqrt(spread), 1e-15)))
