@@ -83,7 +83,7 @@ class Halves(NamedTuple):
         """Estimates of e_A² and e_B² of the pixels, (H, W, 3): each denoised half held to the other."""
         return (self.D_A - self.B) ** 2 - self.V_B, (self.D_B - self.A) ** 2 - self.V_A
 
-    def mixed(self) -> Mixed:
+    def mixed(self) -> MixedHalves:
         """P, Q and N, by the shares of the noisy halves that make errors least."""
         # ---- differences from the denoised halves, and those of the noise, which cells of light share among pixels
         A, B, noise = self.B - self.D_A, self.A - self.D_B, self.A - self.B
@@ -92,10 +92,10 @@ class Halves(NamedTuple):
 
         # ---- K of each
         P, Q, N = (s * x + (s_coarse - s) * low for x, low in zip((A, B, noise), coarse))
-        return Mixed(self.D_A + P, self.D_B + Q, N, self.A, self.B)
+        return MixedHalves(self.D_A + P, self.D_B + Q, N, self.A, self.B)
 
 
-class Mixed(NamedTuple):
+class MixedHalves(NamedTuple):
     """Halves with their shares of noise, (H, W, 3), as in the head of this module."""
 
     P: np.ndarray
@@ -104,10 +104,10 @@ class Mixed(NamedTuple):
     A: np.ndarray
     B: np.ndarray
 
-    def means(self, size: int) -> Mixed:
+    def means(self, size: int) -> MixedHalves:
         """Over blocks of `size` x `size` pixels; those at the ends that are not whole are left out."""
         n, m = (length // size for length in self.P.shape[:2])
-        return Mixed(*(x[: n * size, : m * size].reshape(n, size, m, size, -1).mean(axis=(1, 3)) for x in self))
+        return MixedHalves(*(x[: n * size, : m * size].reshape(n, size, m, size, -1).mean(axis=(1, 3)) for x in self))
 
     def squared(self) -> tuple[np.ndarray, float]:
         """Estimates of e² of the pixels, (H, W, 3), and the part of their sum that is noise, not bias."""
