@@ -163,7 +163,7 @@ def render(picture: Picture) -> dict[str, bytes]:
 
 def fit(found: MaterialFit) -> bytes:
     """The page that flips between the given image of each view and what a fit has found, exposed for the brightest."""
-    scenes, given = {}, [view.given[view.counts] for view in found.views]
+    scenes, given = {}, [view.given[view.counts > 0] for view in found.views]
     bright = max((float(np.percentile(pixels, 97)) for pixels in given if pixels.size), default=1.0)
     exposure = round(-math.log2(bright), 1) if bright > 0 else 0.0
     for view in found.views:
@@ -171,7 +171,7 @@ def fit(found: MaterialFit) -> bytes:
         given, image = (
             np.broadcast_to(np.maximum(np.nan_to_num(each), 0.0), shape) for each in (view.given, view.found)
         )
-        shots = [Shot("given", given), compared("found", image, given, mask=view.counts)]
+        shots = [Shot("given", given), compared("found", image, given, mask=view.counts > 0)]
         scenes[f"{view.name}, held out" if view.held_out else view.name] = shots
     notes = "FLIP and relative squared error of the pixels that count."
     caption = "; ".join([*found.lines(), *found.told])

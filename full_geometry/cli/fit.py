@@ -31,6 +31,13 @@ class DescentOptions:
     loss: Annotated[Literal["relative", "l2", "robust"], typer.Option(help="Loss of the pixels.")] = "relative"
     exposure: Annotated[bool, typer.Option("--exposure", help="Fit a factor of brightness for each image.")] = False
     tv: Annotated[float, typer.Option(help="Weight of the total variation of textures.")] = 0.02
+    light: Annotated[
+        Literal["sampled", "precomputed"],
+        typer.Option(help="Light of translucent_walk; precomputed below rough boundaries."),
+    ] = "sampled"
+    test_spp: Annotated[
+        int, typer.Option(help="Samples a pixel of views held out.", parser=shared.whole, show_default="spp")
+    ] = 0
     seed: shared.Seed = 0
 
 
@@ -39,7 +46,7 @@ class FittedOptions:
     """What is fitted."""
 
     parameter: Annotated[
-        str, typer.Option(help="Any of albedo, reflectance, sigma_t, mfp and g; textures where it has them.")
+        str, typer.Option(help="Any of albedo, reflectance, sigma_t, mfp, g, alpha; textures where it has them.")
     ] = "albedo,sigma_t"
     model: Annotated[str, typer.Option(help="translucent_walk, neural_shape, or a model of the half-space.")] = (
         "translucent_walk"
@@ -174,6 +181,11 @@ def scene_with_medium(scene: Path, name: str | None, found: MaterialFit, painted
         _remove(surface, *COEFFICIENTS)
         for key in ("albedo", "sigma_t", "g"):
             _add_numbers(surface, key, getattr(medium, key) if medium.n_channels else [getattr(medium, key)])
+    if "alpha" in found.values:
+        if (boundary := surface.find("bsdf")) is None:  # a reference, which other surfaces may share
+            return None
+        _remove(boundary, "alpha")
+        ElementTree.SubElement(boundary, "float", name="alpha", value=repr(float(found.values["alpha"][0])))
     if not any(child.get("name") == "eta" for child in surface):
         ElementTree.SubElement(surface, "float", name="eta", value=repr(float(medium.eta)))
     ElementTree.indent(root)
@@ -192,6 +204,8 @@ def _paint(
     if {"sigma_t", "mfp"} & (found.values.keys() | found.textures.keys()):
         _remove(surface, "scale")
     for key, value in found.values.items():
+        if key == "alpha":
+            continue
         other = {"mfp": "sigma_t", "sigma_t": "mfp"}.get(key, key)
         named = key if any(child.get("name") == key for child in surface) else other
         _remove(surface, named)

@@ -32,7 +32,7 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.geometry.sensors import seeded
-from full_geometry.inverse.views import GivenView
+from full_geometry.inverse.views import GivenView, edit
 from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.noise_free import NoiseFree
 from halfspace_sss.physics.medium import Medium
@@ -40,6 +40,9 @@ from halfspace_sss.progress import ProgressText
 from halfspace_sss.provenance import provenance, write_atomically
 
 LOSSES = ("relative", "l2", "robust")
+LIGHTS = ("sampled", "precomputed")
+STEPPED = ("alpha",)  # parameters whose derivatives are differences
+SLOPES = 2  # differences of a pixel, after which they are kept
 FLOOR = 0.1  # of the mean of an image, added to it in relative weights
 BEND = 0.05  # relative residual, beyond which the robust loss grows by its size
 EXPOSURE = 10.0  # most, of a factor
@@ -67,6 +70,9 @@ class FitSettings:
         exposure: whether each image may have a factor of its own, of geometric mean 1.
         seed: of all samples.
         tv: weight of the total variation of textures in their variables.
+        light: of `translucent_walk`: "sampled", or "precomputed", with far less noise from lamps, above all below a
+            rough boundary; derivatives then are differences of renders with the same random numbers.
+        test_spp: samples a pixel of each of the two renders that test a view that is held out; 0 takes spp.
     """
 
     steps: int = 0
@@ -76,11 +82,14 @@ class FitSettings:
     exposure: bool = False
     seed: int = 0
     tv: float = 0.02
+    light: str = "sampled"
+    test_spp: int = 0
 
     def __post_init__(self) -> None:
-        for name, least in (("steps", 0), ("spp", 1), ("batch", 0), ("seed", 0)):
+        for name, least in (("steps", 0), ("spp", 1), ("batch", 0), ("seed", 0), ("test_spp", 0)):
             check_count(name, getattr(self, name), least)
         check_choice("loss", self.loss, LOSSES)
+        check_choice("light", self.light, LIGHTS)
         check_interval("tv", self.tv, 0.0, 1e6)
 
 
@@ -124,8 +133,8 @@ class ChiSquare(NamedTuple):
         for z in residuals:
             z2, padded = z**2, np.pad(z, [(NEAR, NEAR), (NEAR, NEAR), (0, 0)])
             squares += float(z2.sum())
-            far += float((z * (_neighbours(z, FAR_OFF) - _neighbours(z, NEAR))).sum())
-            variance += 2 * float((z2 * (_neighbours(z2, FAR_OFF) - _neighbours(z2, NEAR))).sum())
+            far += float((z * (neighbour_sums(z, FAR_OFF) - neighbour_sums(z, NEAR))).sum())
+            variance += 2 * float((z2 * (neighbour_sums(z2, FAR_OFF) - neighbour_sums(z2, NEAR))).sum())
             h, w, _ = z.shape
             near += [(z * padded[NEAR + i : NEAR + i + h, NEAR + j : NEAR + j + w]).sum() for i, j in shifts]
         near /= squares
@@ -148,7 +157,7 @@ class ChiSquare(NamedTuple):
         ]
 
 
-def _neighbours(z: np.ndarray, reach: int) -> np.ndarray:
+def neighbour_sums(z: np.ndarray, reach: int) -> np.ndarray:
     """Sums over squares of pixels about each pixel of an image (height, width, channels)."""
     for axis in (0, 1):
         padding = [(reach + 1, reach) if a == axis else (0, 0) for a in range(3)]
@@ -166,6 +175,12 @@ class FittedView(NamedTuple):
     found: np.ndarray
     counts: np.ndarray
     held_out: bool
+
+    @property
+    def relative_l1(self) -> float:
+        """Sum of |found - given| over that of given, of pixels as they count; noise of the render is in it."""
+        off, given = (self.counts[..., None] * each for each in (np.abs(self.found - self.given), self.given))
+        return float(off.sum() / given.sum())
 
 
 @dataclass(frozen=True)
@@ -219,6 +234,9 @@ class MaterialFit:
         held = "" if self.held_out is None else f", of views held out {self.held_out.told()} %"
         word, chi_square = "misfit" if self.is_misfit else "noise", self.chi_square
         residuals = f"residuals: {word}, chi-square {chi_square.value:.2f}, by noise 1 ± {chi_square.error:.1g}"
+        if held:
+            medians = (np.median([v.relative_l1 for v in self.views if v.held_out == out]) for out in (False, True))
+            held += ", median relative L1 of views {:.1%}, of those held out {:.1%}".format(*medians)
         return [*told, f"root of the loss {self.misfit.told()} %{held}", residuals]
 
 
@@ -309,13 +327,13 @@ class ViewComparison:
         """Weights w of pixels and channels in step k, 0 where they do not count; and 1 / (I'' - T) at bends."""
         view, e = self.views[which], self.exposures[which]
         counts = np.broadcast_to(view.counts[..., None], view.image.shape).astype(float)
-        if self.settings.loss == "l2" or not view.counts.any():
+        if self.settings.loss == "l2":
             return counts, 0.0
         # Weigh by 1 / (B + floor)², B from renders that are compared with nothing: T and its noise stay out of it.
         if which not in self.shown:
             seeds = [self.seed(k, which, "weights", number) for number in range(FIRST)]
             self.shown[which] = np.mean([self.image(view, seed) for seed in seeds], axis=0)
-        floor = FLOOR * max(float(view.image[view.counts].mean()), 1e-6)
+        floor = FLOOR * max(float(view.image[view.counts > 0].mean()), 1e-6)
         scale = e * np.maximum(self.shown[which], 0) + floor
         weights = counts / np.square(scale)
         if self.settings.loss != "robust":
@@ -324,7 +342,7 @@ class ViewComparison:
         off = e * self.image(view, self.seed(k, which, "weights", FIRST)) - view.image
         factor = 1 / np.maximum(np.abs(off) / scale / BEND, 1)
         bent = np.divide(1.0, off, out=np.zeros_like(off), where=factor < 1)
-        return weights * factor / factor[view.counts].mean(), bent
+        return weights * factor / factor[view.counts > 0].mean(), bent
 
     def _misfit(self, which: int, pair: Sequence[np.ndarray], w: np.ndarray, bent: np.ndarray | float) -> ViewMisfit:
         e, T, n = self.exposures[which], self.views[which].image, self.count(which)
@@ -354,16 +372,37 @@ class ViewComparison:
 
     def image(self, view: GivenView, seed: int) -> np.ndarray:
         """A render of a view, without exposure."""
-        return pixels_of(view, mi.render(self.scene, sensor=view.sensor, seed=seed, spp=self.settings.spp))
+        edit(self.scene, view)
+        spp = (view.held_out and self.settings.test_spp) or self.settings.spp
+        return pixels_of(view, mi.render(self.scene, sensor=view.sensor, seed=seed, spp=spp))
 
     @property
     def at_once(self) -> bool:
         """Whether image and derivatives come from the same paths; models take a pass for each variable."""
-        return hasattr(self.scene.integrator(), "render_derivatives")
+        return hasattr(self.scene.integrator(), "render_derivatives") and not self.by_differences
+
+    @property
+    def by_differences(self) -> bool:
+        """Whether all derivatives are differences of renders: those of precomputed light."""
+        return getattr(self.scene.integrator(), "light", "") == "precomputed"
+
+    def sloping(self, measured: np.ndarray | float, names: Iterable[str]) -> tuple[bool, bool]:
+        """Whether the first and the second render of a view are to have derivatives.
+
+        Differences take further renders, and those by pixels are kept; of models there is little left for products of
+        different renders once there are derivatives.
+
+        Args:
+            measured: how many derivatives the means of the view, or of its pixels, count for.
+            names: of variables.
+        """
+        if self.by_differences or set(names) & set(STEPPED):
+            return bool(np.ndim(measured) == 0 or np.median(measured) < SLOPES), False
+        return True, bool(self.at_once or np.max(measured) < 1)
 
     def sloped(
         self, which: int, k: int, purpose: str, x: Variables, put: Callable[[Variables], None],
-        slopes: bool,
+        slopes: bool, steps: Variables,
     ) -> tuple[np.ndarray, list[np.ndarray]]:  # fmt: skip
         """A render of a view in a step, and its derivatives by each variable, all of whose numbers change alike.
 
@@ -372,8 +411,36 @@ class ViewComparison:
             x: the variables by name.
             put: sets the medium by them, with their gradients.
             slopes: whether derivatives are asked for.
+            steps: of differences, by name.
         """
+        stepped = [name for name in x if self.by_differences or name in STEPPED] if slopes else []
+        if not stepped:
+            return self._followed(which, k, purpose, x, put, slopes)
+        image, found = None, {}
+        if rest := [name for name in x if name not in stepped]:
+            image, slopes_of_rest = self._followed(which, k, purpose, x, put, True, rest)
+            found = dict(zip(rest, slopes_of_rest))
+        # Move each variable in turn, with the same random numbers: (I(x + step) - I(x - step)) / 2 step.
+        view, seed = self.views[which], self.seed(k, which, purpose)
+        for name in stepped:
+            ends = []
+            for sign in (1, -1):
+                moved = {**x, name: x[name] + sign * steps[name]}
+                dr.make_opaque(moved[name])
+                put(moved)
+                ends.append(self.image(view, seed))
+            found[name] = (ends[0] - ends[1]) / np.ravel(2 * np.array(steps[name], dtype=float))
+        put(x)
+        return self.image(view, seed) if image is None else image, [found[name] for name in x]
+
+    def _followed(
+        self, which: int, k: int, purpose: str, x: Variables, put: Callable[[Variables], None], slopes: bool,
+        names: Sequence[str] = (),
+    ) -> tuple[np.ndarray, list[np.ndarray]]:  # fmt: skip
+        """`sloped` by derivatives that the integrator follows, by all variables or those of some names."""
         view, spp, integrator = self.views[which], self.settings.spp, self.scene.integrator()
+        names = names or list(x)
+        edit(self.scene, view)
         seed, found = self.seed(k, which, purpose), []
 
         def followed(names: Iterable[str]) -> Variables:
@@ -383,14 +450,15 @@ class ViewComparison:
             return result
 
         if slopes and self.at_once:
-            followed_x = followed(x)
+            followed_x = followed(names)
             put(followed_x)
-            image, found = integrator.render_derivatives(self.scene, list(followed_x.values()), view.sensor, seed, spp)
+            by = [followed_x[name] for name in names]
+            image, found = integrator.render_derivatives(self.scene, by, view.sensor, seed, spp)
             put(x)
             return pixels_of(view, image), [pixels_of(view, d) for d in found]
         put(x)
         image = self.image(view, seed)
-        for j, name in enumerate(x if slopes else ()):
+        for j, name in enumerate(names if slopes else ()):
             followed_x = followed([name])
             dr.set_grad(followed_x[name], 1.0)
             put(followed_x)
@@ -407,7 +475,7 @@ class ViewComparison:
 
     def fingerprint(self, *start: object) -> str:
         """A hash of the images, the settings, the start of a fit, and versions."""
-        views = [(v.sensor, v.held_out) for v in self.views]
+        views = [(v.sensor if isinstance(v.sensor, int) else str(v.sensor), v.held_out, v.edits) for v in self.views]
         told = provenance()
         of = [asdict(self.settings), start, views, told["versions"], told["commit"]]
         digest = hashlib.sha256(json.dumps(of).encode())

@@ -46,6 +46,7 @@ from halfspace_sss.progress import ProgressText
 from halfspace_sss.provenance import check_folder
 
 STEPS = 30
+STEP = 0.15  # of variables, for differences
 DAMPED = 1e-3  # of the largest eigenvalue of H, below which it is not trusted
 WALK = "translucent_walk"
 
@@ -81,7 +82,7 @@ def fit(
     check_variant()
     settings = settings or FitSettings()
     if not isinstance(scene, mi.Scene):
-        walks = {"light": "sampled"} if model == WALK else {}  # as derivatives are, with the same bits in each run
+        walks = {"light": settings.light} if model == WALK else {}  # as derivatives are, with the same bits in each run
         scene = open_scene(scene, PATH_TRACED if model == WALK else model, settings=walks, floats=True)
     shape = translucent_object(scene, object)
     check_derivatives(scene.integrator(), shape, parameters)
@@ -223,8 +224,8 @@ class MediumDescent:
         means = self.means.setdefault(which, ViewMeans.none(view.image.size, len(x)))
         if k < SETTLING * self.total:
             means.forget(x)
-        both = compared.at_once or means.jacobians < 1  # little is left for products of different renders
-        (a, J), (b, other_J) = self._render(which, k, "first", True), self._render(which, k, "second", both)
+        one, both = compared.sloping(means.jacobians, self.x)
+        (a, J), (b, other_J) = self._render(which, k, "first", one), self._render(which, k, "second", both)
         misfit = compared.view(which, k, [a, b])
         w, stiffness = (v.ravel() / compared.count(which) for v in (misfit.weights, misfit.stiffness))
         noise = 2 * misfit.noise.ravel() / compared.exposures[which] ** 2
@@ -330,7 +331,8 @@ class MediumDescent:
 
     def _render(self, which: int, k: int, purpose: str, sloped: bool) -> tuple[np.ndarray, np.ndarray | None]:
         """A render of a view, and derivatives of its pixels by all variables; a channel knows of no other but by g."""
-        image, found = self.comparison.sloped(which, k, purpose, self.x, self.parameters.put, sloped)
+        steps = {name: type(value)(STEP) for name, value in self.x.items()}
+        image, found = self.comparison.sloped(which, k, purpose, self.x, self.parameters.put, sloped, steps)
         return image, self._columns(found) if sloped else None
 
     def _columns(self, found: Sequence[np.ndarray]) -> np.ndarray:

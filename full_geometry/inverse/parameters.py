@@ -1,4 +1,4 @@
-"""Parameters of a medium that are fitted, as variables without bounds: logit albedo, log sigma_t or mfp, artanh g."""
+"""Parameters that are fitted, as variables without bounds: logit albedo, log sigma_t, mfp or alpha, artanh g."""
 
 from __future__ import annotations
 
@@ -13,16 +13,18 @@ from full_geometry.geometry.shape import name_of
 from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.objects.objects import KnowsUnit, translucent_shapes
 from full_geometry.surface.medium_derivatives import MediumDerivatives
-from full_geometry.surface.translucent import VARIABLE
+from full_geometry.surface.translucent import VARIABLE, is_rough
 from full_geometry.surface.wrapped import surface_of
 from full_geometry.transport.models import lookup
 from halfspace_sss.checks import check_choice
 from halfspace_sss.neural.universal import Neural
 from halfspace_sss.registry import bssrdf
 
-NAMES = ("albedo", "sigma_t", "mfp", "g")
+NAMES = ("albedo", "sigma_t", "mfp", "g", "alpha")
+ROUGHNESS = "boundary.alpha.value"  # key of alpha in the surface
 ALBEDO = (1e-4, 1 - 1e-5)  # bounds
 G = 0.98  # |g| is less
+ALPHA = (0.01, 1.0)  # bounds
 SIZES = (0.02, 5e3)  # of the object, mean free paths
 NEAR = 0.02  # of the way between bounds, in the variable, that counts as at a bound
 
@@ -76,12 +78,23 @@ def check_names(names: Sequence[str], known: Sequence[str]) -> None:
     """ValueError if names of parameters are none of those known, are there twice, or ask for sigma_t and mfp both."""
     if not names or len(set(names)) < len(names):
         raise ValueError(f"parameters must be one or more of {', '.join(known)}, each once, got {list(names)}")
-    if "alpha" in names:
-        raise ValueError("parameter must not be alpha: a rough boundary stays as it is, there is no derivative by it")
     for name in names:
         check_choice("parameter", name, known)
     if {"sigma_t", "mfp"} <= set(names):
         raise ValueError("parameters must be sigma_t or mfp, got both")
+
+
+def roughness(shape: mi.Shape) -> float:
+    """alpha of the boundary of an object.
+
+    Raises:
+        ValueError: it is smooth, or its alpha is a texture or one for each axis.
+    """
+    parameters = mi.traverse(surface_of(shape))
+    if ROUGHNESS not in parameters:
+        got = "a texture or one for each axis" if is_rough(surface_of(shape).boundary) else "a smooth boundary"
+        raise ValueError(f"alpha of {name_of(shape)} must be a number of a roughdielectric to be fitted, got {got}")
+    return float(np.ravel(parameters[ROUGHNESS])[0])
 
 
 def size_bounds(shape: mi.Shape, mm_per_unit: float) -> tuple[float, float]:
@@ -123,6 +136,8 @@ class FitParameters:
         for name in self.names:
             if name == "g":  # one for all channels
                 x = mi.Float(np.arctanh(np.clip(np.mean(np.ravel(surface.g)), -0.95 * G, 0.95 * G) / G))
+            elif name == "alpha":
+                x = mi.Float(np.log(roughness(self.shape)))
             elif name == "albedo":
                 a = np.clip(np.ravel(surface.albedo), 0.01, 0.999)
                 x = mi.Spectrum(np.log(a / (1 - a)).tolist())
@@ -136,6 +151,8 @@ class FitParameters:
             return tuple(float(np.log(a / (1 - a))) for a in ALBEDO)
         if name == "g":
             return -3.0, 3.0
+        if name == "alpha":
+            return tuple(float(np.log(alpha)) for alpha in ALPHA)
         low, high = (float(np.log(size)) for size in self.sizes)
         return (low, high) if name == "sigma_t" else (-high, -low)
 
@@ -146,19 +163,25 @@ class FitParameters:
         return clipped
 
     def values(self, x: dict[str, mi.Float | mi.Spectrum]) -> dict[str, mi.Spectrum]:
-        """Coefficients of the surface, with the gradients of the variables."""
+        """Coefficients of the surface and alpha, with the gradients of the variables."""
         result = {}
         for name, value in x.items():
             if name == "albedo":
                 result[name] = 1 / (1 + dr.exp(-value))
             elif name == "g":
                 result[name] = mi.Spectrum(G * dr.tanh(value))
+            elif name == "alpha":
+                result[name] = dr.exp(value)
             else:
                 result["sigma_t"] = dr.exp(value if name == "sigma_t" else -value)
         return result
 
     def put(self, x: dict[str, mi.Float | mi.Spectrum]) -> None:
         surface, values = surface_of(self.shape), self.values(x)
+        if "alpha" in values:
+            parameters = mi.traverse(surface)
+            parameters[ROUGHNESS] = values.pop("alpha")
+            parameters.update()
         for name, value in values.items():
             setattr(surface, name, value)
         surface.parameters_changed([name for name in VARIABLE if name in values])

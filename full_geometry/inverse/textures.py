@@ -30,6 +30,7 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.sparse import block_diag, csr_array, diags_array, hstack, kron, vstack
 from scipy.sparse.linalg import LinearOperator, cg
 
@@ -48,13 +49,26 @@ from full_geometry.inverse.comparing import (
     arrays_of_means,
     kept_at,
     means_of_arrays,
+    neighbour_sums,
 )
-from full_geometry.inverse.parameters import ALBEDO, NEAR, G, check_names, size_bounds, translucent_object
+from full_geometry.inverse.parameters import (
+    ALBEDO,
+    ALPHA,
+    NEAR,
+    ROUGHNESS,
+    G,
+    check_names,
+    roughness,
+    size_bounds,
+    translucent_object,
+)
 from full_geometry.scenes.scene_files import PATH_TRACED, open_scene
 from full_geometry.surface.textured import TexturedMedium, kind_of, shown
 from full_geometry.surface.wrapped import surface_of
 
 STEPS = 60
+STEP = 0.15  # of a parameter, for differences
+NEAR_PIXELS = 1  # over which differences are averaged
 RAYS = 16  # of a pixel, for D
 LAST = {"albedo": 9.0, "reflectance": 9.0, "g": 2.9}  # size of variables beyond which they are at a bound
 EXPOSURE_MEMORY = 0.2  # of the step to the best exposure, what is taken
@@ -132,12 +146,24 @@ class Variable:
             return (v - low) * (high - v) / (high - low)
         return G - v**2 / G if self.name == "g" else v
 
-    def numbers(self, x: np.ndarray) -> mi.Float | mi.Spectrum | mi.TensorXf:
-        """The numbers that stand in the scene for variables."""
+    def numbers(self, x: np.ndarray, change: ArrayLike = 0.0) -> mi.Float | mi.Spectrum | mi.TensorXf:
+        """The numbers that stand in the scene for variables, where what a texture shows changes evenly."""
         numbers = (self.parameter(x) / self.factor).astype(np.float32)
+        if np.any(change):
+            low, high = (end / self.factor for end in self._ends())
+            numbers = numbers.reshape(self.start.shape) + change * self.unit / self.factor
+            numbers = np.clip(numbers.ravel(), low, high).astype(np.float32)
         value = self.kind(numbers.reshape(self.start.shape)) if self.start.ndim == 3 else self.kind(numbers.tolist())
         dr.make_opaque(value)  # as literals they would be code, and each step would compile anew
         return value
+
+    def step(self, x: np.ndarray) -> mi.Float | mi.Spectrum:
+        """Half the span of a difference: a share of the mean of each channel, of what a texture shows or a constant."""
+        v = self.parameter(x).reshape(-1, self.start.shape[-1]).mean(axis=0)
+        step = np.full_like(v, STEP) if self.name == "g" else STEP * v
+        if self.is_texture:
+            return mi.Spectrum((np.broadcast_to(step, len(mi.Spectrum(0))) / self.unit).tolist())
+        return self.kind((step / self.factor).tolist())
 
     def shown(self, x: np.ndarray) -> np.ndarray:
         """The parameter as people write it, in the shape of the start."""
@@ -238,7 +264,9 @@ class TextureParameters:
         textured = surface_of(shape).spec.textured
         constants = [name for name in textured.constants if name != "sigma_t"]
         lengths = ["sigma_t", "mfp"] if "sigma_t" in textured.constants else []
-        check_names(names, (*textured.textures, *constants, *lengths))
+        check_names(names, (*textured.textures, *constants, *lengths, "alpha"))
+        if "alpha" in names:
+            roughness(shape)
         parameters = mi.traverse(scene)
         return cls(shape, [_variable(name, shape, textured, mm_per_unit, parameters) for name in names])
 
@@ -249,6 +277,8 @@ def _variable(
     texture, factor, unit, pairs, n = textured.textures.get(name), 1.0, 1.0, None, len(mi.Spectrum(0))
     if texture is None:
         owner, ending = surface_of(shape), "sigma_t" if name == "mfp" else name
+        if name == "alpha":
+            owner, ending = mi.traverse(owner).properties[ROUGHNESS][2], "value"
     elif kind_of(texture) == "BitmapTexture":
         owner, ending = texture, "data"
     elif kind_of(texture) == "MeshAttribute":
@@ -296,6 +326,8 @@ def _bounds(
     if name in ("albedo", "reflectance"):
         most = np.broadcast_to(textured.table.most if name == "reflectance" else 1.0, n)
         return ALBEDO[0] * most, ALBEDO[1] * most
+    if name == "alpha":
+        return tuple(np.full(1, alpha) for alpha in ALPHA)
     low, high = (-G, G) if name == "g" else size_bounds(shape, mm_per_unit)
     if name == "mfp" and not constant:
         low, high = 1 / high, 1 / low
@@ -449,9 +481,9 @@ class TextureDescent:
         # Forget what was measured at other texels: D v has moved by |D v - mean D v| / D v' in the variables.
         if k < SETTLING * self.total:
             means.forget(shown, self._at_pixels(which, by_x=True))
-        # Render twice with independent samples; models take their slopes of the second render at the start alone.
-        both = compared.at_once or not means.sloped.any()
-        renders = [self._render(which, k, "first", True), self._render(which, k, "second", both)]
+        # Render twice with independent samples; differences are measured anew where little is left of them.
+        one, both = compared.sloping(np.ceil(means.sloped), [v.name for v in self.variables])
+        renders = [self._render(which, k, "first", one), self._render(which, k, "second", both)]
         misfit = compared.view(which, k, [image for image, _ in renders])
         # Add both to the means; the variance of I is that of e I over e², twice that of the mean of the pair.
         w, stiffness = (v.ravel() / compared.count(which) for v in (misfit.weights, misfit.stiffness))
@@ -461,13 +493,17 @@ class TextureDescent:
         return misfit
 
     def _render(self, which: int, k: int, purpose: str, sloped: bool) -> tuple[np.ndarray, np.ndarray | None]:
-        image, found = self.comparison.sloped(which, k, purpose, self._followed(), self._put, sloped)
+        x, steps = self._followed(), {v.name: v.step(x) for v, x in zip(self.variables, self._parts())}
+        image, found = self.comparison.sloped(which, k, purpose, x, self._put, sloped, steps)
+        if sloped and self.comparison.by_differences:  # their noise would make steps short
+            found = [neighbour_sums(each, NEAR_PIXELS) / (2 * NEAR_PIXELS + 1) ** 2 for each in found]
         return image, np.stack([each.ravel() for each in found]) if sloped else None
 
     def _put(self, followed: Variables) -> None:
         """Set textures and constants, these with their gradients, and what has those of textures."""
         for v, x in zip(self.variables, self._parts()):
-            self.scene_parameters[v.key] = v.numbers(x) if v.is_texture else followed[v.name]
+            change = np.ravel(np.array(dr.detach(followed[v.name]), dtype=float))[: v.start.shape[-1]]
+            self.scene_parameters[v.key] = v.numbers(x, change) if v.is_texture else followed[v.name]
         self.scene_parameters.update()
         # Differentiate by an even change of each texture, which the surface adds to what its texels show.
         surface = surface_of(self.parameters.shape)
@@ -486,7 +522,7 @@ class TextureDescent:
         for which in self.comparison.fitted:
             view = self.comparison.views[which]
             height, width, channels = view.image.shape
-            at, si, corner = self._points(view.sensor)
+            at, si, corner = self._points(which)
             for j, v in enumerate(self.variables):
                 # Add the weights of texels up over the rays of a pixel, and scale each row of D to the sum 1.
                 texels, weights = v.places(self.parameters.shape, si, corner)
@@ -498,9 +534,10 @@ class TextureDescent:
                 result[which, j] = csr_array(kron(D, spread))
         return result
 
-    def _points(self, number: int) -> tuple[np.ndarray, mi.SurfaceInteraction3f, mi.Point2f]:
-        """Pixels, interactions and barycentric coordinates of the rays of a camera that meet the object."""
-        scene, sensor = self.comparison.scene, self.comparison.scene.sensors()[number]
+    def _points(self, which: int) -> tuple[np.ndarray, mi.SurfaceInteraction3f, mi.Point2f]:
+        """Pixels, interactions and barycentric coordinates of the rays of a view that meet the object."""
+        scene, view = self.comparison.scene, self.comparison.views[which]
+        number, sensor = view.sensor if isinstance(view.sensor, int) else which, view.camera(scene)
         film, ray = sensor.film(), camera_rays(sensor, RAYS, (self.comparison.settings.seed, number))
         width, height = (int(n) for n in film.crop_size())
         met = scene.ray_intersect_preliminary(mi.Ray3f(ray[0]))

@@ -76,7 +76,11 @@ def test_views_and_parameters_that_do_not_fit_are_refused_by_name(tmp_path: Path
     refused("image a must be 8 x 8 of 3 channels as sensor 0, got 4 x 8", [GivenView.of("a", 0, image[:, :4])])
     refused("sensor of a must be below 1", [GivenView.of("a", 1, image)])
     refused("parameter must be one of albedo.*got 'albdo'; did you mean 'albedo'", names=("albdo",))
-    refused("parameter must not be alpha: a rough boundary stays as it is", names=("alpha",))
+    refused("alpha of 'ball' must be a number of a roughdielectric to be fitted, got a smooth", names=("alpha",))
+    refused("edits of b must be of the keys none as of a", [good, GivenView.of("b", 0, image, edits={"x": [1]})])
+    refused("lamp in edits of a must be the key of numbers", [GivenView.of("a", 0, image, edits={"lamp": [1]})])
+    key = "ball.bsdf.albedo"
+    refused(f"{key} in edits of a must be 3 finite numbers", [GivenView.of("a", 0, image, edits={key: [1]})])
     refused("sigma_t or mfp, got both", names=("mfp", "sigma_t"))
     refused("object must be one of ball", object="bell")
     refused("not held out, got none", [GivenView.of("a", 0, image, held_out=True)])
@@ -226,19 +230,37 @@ def test_a_robust_loss_leaves_out_spoiled_pixels_and_has_no_bias_by_noise(tmp_pa
     assert errors[False, "relative"] > 2 * errors[False, "robust"]
 
 
+LAMP = """<emitter type="point" id="lamp"><point name="position" x="0" y="0" z="40"/>
+  <rgb name="intensity" value="3000"/></emitter>"""
+ROUGH = """<float name="eta" value="1.4"/><bsdf type="roughdielectric"><float name="alpha" value="0.25"/>
+  <float name="int_ior" value="1.4"/><float name="ext_ior" value="1"/></bsdf>"""
+
+
 @pytest.mark.slow
-def test_the_albedo_below_a_rough_boundary_is_found_and_the_boundary_kept(tmp_path: Path) -> None:
-    boundary = """<bsdf type="roughdielectric" name="boundary"><float name="alpha" value="0.3"/>
-      <float name="int_ior" value="1.3"/><float name="ext_ior" value="1"/></bsdf>"""
-    (tmp_path / "a.xml").write_text(XML.replace('<float name="eta" value="1"/>', boundary))
-    mi.Bitmap(_target(open_scene(tmp_path / "a.xml"))).write(str(tmp_path / "a.exr"))
-    (tmp_path / "views.json").write_text(json.dumps({"views": [{"image": "a.exr"}]}))
-    how = ["--images", str(tmp_path / "views.json"), "--parameter", "albedo", "--steps", "24", "--out", str(tmp_path)]
-    found = CliRunner().invoke(cli.app, ["fit", str(tmp_path / "a.xml"), *how])
-    assert found.exit_code == 0, found.output
-    surface = open_scene(tmp_path / "a_fit.xml").shapes()[0].bsdf()
-    assert np.ravel(surface.albedo) == pytest.approx(TRUE["albedo"], abs=0.015)
-    assert float(mi.traverse(surface)["boundary.alpha.value"][0]) == pytest.approx(0.3)
+def test_albedo_and_roughness_are_found_from_photographs_with_a_lamp_of_their_own(tmp_path: Path) -> None:
+    """A lamp at the camera and one aside, of which the command writes the scene, with three seeds."""
+    light = XML[XML.index("  <emitter") : XML.index("  <sensor")]
+    text = XML.replace(light, LAMP).replace('<float name="eta" value="1"/>', ROUGH).replace('value="8"', 'value="16"')
+    (tmp_path / "a.xml").write_text(text.replace("0.5", "2").replace("sampled", "precomputed"))
+    scene, rows = open_scene(tmp_path / "a.xml"), []
+    scene.shapes()[0].bsdf().albedo = mi.Spectrum(TRUE["albedo"])
+    parameters = mi.traverse(scene)
+    parameters["ball.bsdf.boundary.alpha.value"] = mi.Float(0.3)
+    for k, place in enumerate(([0, 0, 40], [25, 10, 20])):
+        parameters["lamp.position"] = mi.Point3f(place)
+        parameters.update()
+        mi.Bitmap(mi.render(scene, spp=1024, seed=90 + k)).write(str(tmp_path / f"{k}.exr"))
+        camera = {"origin": [0, 0, 40], "target": [0, 0, 0], "up": [0, 1, 0], "fov": 14}
+        rows.append({"image": f"{k}.exr", "camera": camera, "edits": {"lamp.position": place}})
+    (tmp_path / "views.json").write_text(json.dumps({"views": rows}))
+    how = ["--images", str(tmp_path / "views.json"), "--parameter", "albedo,alpha", "--light", "precomputed"]
+    how += ["--steps", "16", "--out", str(tmp_path)]
+    for seed in range(3):
+        found = CliRunner().invoke(cli.app, ["fit", str(tmp_path / "a.xml"), *how, "--seed", str(seed)])
+        assert found.exit_code == 0, found.output
+        surface = open_scene(tmp_path / "a_fit.xml").shapes()[0].bsdf()
+        assert np.ravel(surface.albedo) == pytest.approx(TRUE["albedo"], abs=0.015)
+        assert float(mi.traverse(surface)["boundary.alpha.value"][0]) == pytest.approx(0.3, abs=0.02)
 
 
 @pytest.mark.parametrize("model", ["translucent_walk", pytest.param("better_dipole", marks=pytest.mark.slow)])

@@ -145,7 +145,7 @@ def test_textures_that_cannot_be_fitted_are_refused_by_name(tmp_path: Path) -> N
 
     path = _bitmap(tmp_path, np.full((4, 4, 3), 0.3), "reflectance")
     path.write_text(path.read_text().replace("sigma_t", "mfp"))
-    refused("parameter must be one of reflectance, sigma_t, mfp, got 'albedo'", path, "albedo")
+    refused("parameter must be one of reflectance, sigma_t, mfp, alpha, got 'albedo'", path, "albedo")
     path = _bitmap(tmp_path, np.full((4, 4, 3), 0.3))
     refused("sigma_t or mfp, got both", path, "albedo", "sigma_t", "mfp")
     board = '<texture type="checkerboard" name="albedo"/>'
@@ -205,3 +205,43 @@ def test_a_killed_fit_of_textures_goes_on_with_the_same_bits_and_writes_a_scene(
         assert error.shape == (4, 6, 3) and (error > 0).any()
     else:
         assert "texels or vertices of albedo are seen by no view" in " ".join(whole.output.split())
+
+
+@pytest.mark.slow
+def test_reflectance_path_length_and_roughness_of_a_photographed_object_explain_a_view_that_is_held_out(
+    tmp_path: Path,
+) -> None:
+    """Cameras, lamps and masks as of photographs."""
+    lamp = """<emitter type="point" id="lamp"><point name="position" x="0" y="0" z="30"/>
+      <rgb name="intensity" value="1500"/></emitter>"""
+    boundary = """<bsdf type="roughdielectric"><float name="alpha" value="ALPHA"/><float name="int_ior" value="1.3"/>
+      <float name="ext_ior" value="1"/></bsdf>"""
+    i, j = np.indices((4, 4))
+    true = np.where(((i + j) % 2 == 0)[..., None], [0.4, 0.3, 0.1], [0.2, 0.25, 0.3])
+
+    def scene(values: np.ndarray, alpha: float, mfp: float) -> Path:
+        path = _bitmap(tmp_path, values, "reflectance")
+        text = path.read_text().replace('name="sigma_t" value="3"', f'name="mfp" value="{mfp}"')
+        light = text[text.index("  <emitter") : text.index("  <sensor")]
+        text = text.replace(light, lamp).replace("</bsdf>", boundary.replace("ALPHA", str(alpha)) + "</bsdf>", 1)
+        path.write_text(text.replace("<boolean", '<string name="light" value="precomputed"/><boolean', 1))
+        return path
+
+    shown, rows = open_scene(scene(true, 0.3, 0.5)), []
+    parameters = mi.traverse(shown)
+    for k, place in enumerate(([0, 3, 30], [20, 0, 20], [-12, 10, 25])):
+        parameters["lamp.position"] = mi.Point3f(place)
+        parameters.update()
+        image = np.array(mi.render(shown, spp=512, seed=90 + k))
+        mi.Bitmap(image).write(str(tmp_path / f"{k}.exr"))
+        mi.Bitmap((image.max(axis=2, keepdims=True) > 0).astype(np.float32)).write(str(tmp_path / f"mask{k}.exr"))
+        camera = {"origin": [0, 0, 40], "target": [0, 0, 0], "up": [0, 1, 0], "fov": 9}
+        row = {"image": f"{k}.exr", "mask": f"mask{k}.exr", "camera": camera, "edits": {"lamp.position": place}}
+        rows.append({**row, "held_out": k == 2})
+    (tmp_path / "views.json").write_text(json.dumps({"views": rows}))
+    settings = inverse.FitSettings(steps=8, spp=32, light="precomputed", test_spp=256)
+    views = read_views(tmp_path / "views.json")
+    start = scene(np.full((4, 4, 3), 0.25), 0.2, 0.8)
+    found = inverse.fit(start, views, ("reflectance", "mfp", "alpha"), settings=settings)
+    assert found.views[-1].held_out and found.views[-1].relative_l1 < 0.1
+    assert found.values["alpha"] == pytest.approx(0.3, abs=0.05)

@@ -19,6 +19,7 @@ from full_geometry.inverse.views import GivenView, read_views  # noqa: E402
 pytestmark = pytest.mark.usefixtures("quiet_rgb")
 
 WHOLE = np.full((8, 8, 3), 0.5, np.float32)
+CAMERA = {"origin": [0, 0, 40], "target": [0, 0, 0], "up": [0, 1, 0], "fov": 14}
 
 
 @pytest.mark.parametrize(
@@ -30,6 +31,11 @@ WHOLE = np.full((8, 8, 3), 0.5, np.float32)
         ({"views": [{"image": 3}]}, "image must be a file, got 3"),
         ({"views": [{"image": "a.exr", "mask": 3}]}, "mask must be a file, got 3"),
         ({"views": [{"image": "a.exr", "held_out": "false"}]}, "held_out must be true or false, got 'false'"),
+        ({"views": [{"image": "a.exr", "camera": 3}]}, "camera must be an object, got 3"),
+        ({"views": [{"image": "a.exr", "camera": {"fov": 3}}]}, "must have origin, target, up, fov, got fov"),
+        ({"views": [{"image": "a.exr", "camera": {**CAMERA, "up": [1]}}]}, "up of .* must be 3 finite numbers"),
+        ({"views": [{"image": "a.exr", "camera": {**CAMERA, "up": [0, 0, 1]}}]}, "must not be along its view"),
+        ({"views": [{"image": "a.exr", "camera": CAMERA, "sensor": 0}]}, "must have a sensor or a camera, got both"),
     ],
 )
 def test_a_file_of_views_that_is_none_is_refused_in_words(tmp_path: Path, content: Any, message: str) -> None:
@@ -38,6 +44,19 @@ def test_a_file_of_views_that_is_none_is_refused_in_words(tmp_path: Path, conten
     with pytest.raises(ValueError, match=message) as caught:
         read_views(tmp_path / "views.json")
     assert "Error" not in str(caught.value)
+
+
+def test_a_view_with_its_own_camera_shows_the_part_that_counts_by_its_mask(tmp_path: Path) -> None:
+    mask = np.zeros((8, 8, 1), np.float32)
+    mask[2:5, 3:7] = 0.25
+    for name, image in (("a.exr", WHOLE), ("mask.exr", mask)):
+        mi.Bitmap(image).write(str(tmp_path / name))
+    row = {"image": "a.exr", "mask": "mask.exr", "camera": CAMERA, "edits": {"lamp.position": [1, 2, 3]}}
+    (tmp_path / "views.json").write_text(json.dumps({"views": [row]}))
+    (view,) = read_views(tmp_path / "views.json")
+    film = view.sensor.film()
+    assert (list(film.size()), list(film.crop_size()), list(film.crop_offset())) == ([8, 8], [4, 3], [3, 2])
+    assert view.image.shape == (3, 4, 3) and (view.counts == 0.25).all() and view.edits == row["edits"]
 
 
 @pytest.mark.parametrize(
