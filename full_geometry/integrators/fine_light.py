@@ -6,8 +6,13 @@ too bright, or lost. So the light of such an emitter at point k is its mean over
     L_k = 1 / (A_k n) Σ_s a(mu_s) mu_s E_s / p_s,
 
 E_s the irradiance across the ray at the place s of density p_s: uniform places, or where few of these are lit those
-that rays of the emitter meet. What leaves has the flux Σ_k A_k W_k ρ_k L_k, W = ∫ a(mu) mu dw and ρ the sums of rows,
-as the transport is reciprocal: B is scaled to that, since few entries are at one point.
+that rays of the emitter meet. Between points B is blended with weights S, which blurs detail of a few distances. So at
+the points there is the approximate inverse of that (Van Cittert 1931),
+
+    B_(m+1) = B_m + B - S B_m,    B_0 = B.
+
+What leaves has the flux Σ_k A_k W_k ρ_k L_k, W = ∫ a(mu) mu dw and ρ the sums of rows, as the transport is reciprocal:
+B is scaled to that, since few entries are at one point.
 """
 
 from __future__ import annotations
@@ -33,6 +38,8 @@ COUNT = 2**18  # places, and rays of an emitter
 KINDS = ("SpotLight", "Projector")
 ROOTS = (0.8566748838545029, 0.7338918566271260, 0.6287067210378087, 0.5385972572236101)  # of four dimensions
 UNEVEN = 0.1  # mean difference of light at points from that of their surroundings, over its mean, that makes it fine
+BLURRED = 0.05  # likewise of that of their surroundings from what is blended of it
+SHARPENINGS = 2  # of what leaves: more brings little contrast, and noise of the transport matrix
 LIT = 2**12  # places in effect, below which rays of the emitter take their place
 LOST = 0.5  # root mean square of detail below the distance of points, over that of the light, which is told
 
@@ -61,19 +68,26 @@ class FineLight:
     area: np.ndarray
 
     def leaving(self, T: TransportMatrix, scaled: bool) -> np.ndarray:
-        """B of that light as `T @` returns it, `scaled` to its flux."""
-        B = T @ self.incident
+        """B of that light as `T @` returns it, sharpened, and `scaled` to its flux."""
+        # B_(m+1) = B_m + B - S B_m of the mean over w_o
+        B, mean = T @ self.incident, T.mean(self.incident)
+        sharp = mean
+        for _ in range(SHARPENINGS):
+            sharp = sharp + mean - T.points.smoothed(sharp)
+        B[:, :, 0] += sharp - mean
+
+        # the flux Σ A W B is Σ A W ρ L
         if scaled:
             weight = self.area[:, None] * T.around.whole
             wanted = (weight * T.t.sum(axis=1) * self.incident.mean).sum(axis=0)
-            B *= (wanted / np.maximum((weight * T.mean(self.incident)).sum(axis=0), 1e-30))[:, None]
+            B *= (wanted / np.maximum((weight * sharp).sum(axis=0), 1e-30))[:, None]
         return B
 
 
 def fine_light(
     scene: mi.Scene, instance_scene: InstanceScene, obj: TranslucentObject, T: TransportMatrix
 ) -> FineLight | None:
-    """The light of spots and projectors whose mean about points differs from that at them; None without any."""
+    """The light of spots and projectors that differs about points from that at or between them; None without any."""
     emitters = [e for e in scene.emitters() if e.class_name() in KINDS]
     if not emitters:
         return None
@@ -94,9 +108,10 @@ def fine_light(
         if not sums.any():
             continue
 
-        # it is fine where that differs from the light at the points
+        # it is fine where that differs from the light at the points, or from what is blended between them
         here, _ = _arriving(view, (T.points.p, T.points.n, T.points.n_out), emitter)
-        if (area[:, None] * abs(sums - here)).sum() < UNEVEN * (area[:, None] * sums).sum():
+        kinds = (sums - here, UNEVEN), (sums - T.points.smoothed(sums), BLURRED)
+        if all((area[:, None] * abs(d)).sum() < least * (area[:, None] * sums).sum() for d, least in kinds):
             continue
         lost = 1 - (area[:, None] * sums**2).sum() / max((light.value * light.square).sum(), 1e-30)
         if lost > LOST**2:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -11,7 +12,7 @@ import pytest
 
 from full_geometry.geometry.light_points import SurfacePoints, uniform_entries
 from full_geometry.geometry.shape import analyse_shape
-from full_geometry.integrators.fine_light import fine_light
+from full_geometry.integrators.fine_light import FineLight, fine_light
 from full_geometry.integrators.gathering import _steadied, _stratified
 from full_geometry.learning.meshes import Box, box, surface
 from full_geometry.precomputed.entries import StratifiedEntries
@@ -328,17 +329,26 @@ def _laser(x: float, y: float, angle: float = 0.3) -> dict:
     return {"laser": {"type": "spot", "cutoff_angle": angle, "beam_width": angle, "intensity": 1e3, "to_world": view}}
 
 
-@pytest.mark.parametrize("place", [(0.1, 0.2), (-0.33, 0.17)])
-def test_a_laser_finer_than_the_points_keeps_its_flux_and_is_told(place: tuple[float, float]) -> None:
-    """It was lost at the second place. Σ A W L is a(mu) times the power within 0.5 %, and what leaves ρ of that."""
+@cache
+def _laser_at(place: tuple[float, float]) -> tuple[Any, FineLight]:
+    """The object, with what leaves it, and what the beam brings to its points."""
     scene = _scene("gathered", lights=_laser(*place))
     with pytest.warns(
         UserWarning, match="emitter 'laser' has detail finer than .*% of its contrast is lost, its flux is"
     ):
         mi.render(scene, spp=1)
     (obj,) = scene.integrator().gathering._found
+    return obj, fine_light(scene, obj.instance_scene, obj, obj.gathered.matrix)
+
+
+PLACES = [(0.1, 0.2), (-0.33, 0.17)]
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_a_laser_finer_than_the_points_keeps_its_flux_and_is_told(place: tuple[float, float]) -> None:
+    """It was lost at the second place. Σ A W L is a(mu) times the power within 0.5 %, and what leaves ρ of that."""
+    obj, fine = _laser_at(place)
     T = obj.gathered.matrix
-    fine = fine_light(scene, obj.instance_scene, obj, T)
     weight = fine.area[:, None] * T.around.whole
     power = 1e3 * 2 * np.pi * (1 - np.cos(np.radians(0.3)))
     mu = np.sqrt(1 - place[0] ** 2 - place[1] ** 2)
@@ -349,6 +359,19 @@ def test_a_laser_finer_than_the_points_keeps_its_flux_and_is_told(place: tuple[f
     assert (weight * B).sum(axis=0) == pytest.approx(
         (weight * T.t.sum(axis=1) * fine.incident.mean).sum(axis=0), rel=5e-3
     )
+
+
+def test_stripes_are_blended_between_points_with_the_contrast_that_they_have_there() -> None:
+    """Of stripes five distances of points apart a fifth was lost between these."""
+    obj, fine = _laser_at(PLACES[0])
+    T, wave = obj.gathered.matrix, np.cos(18 * np.array(obj.gathered.points.p)[0])[:, None]
+    mean = np.repeat(1 + wave, 3, axis=1).astype(np.float32)
+    stripes = replace(fine, incident=replace(fine.incident, mean=mean, moment=0 * fine.incident.moment))
+    B, wanted = stripes.leaving(T, scaled=False)[:, :, 0], T.mean(stripes.incident)
+    there, sharp, blurred = (
+        ((v - v.mean(axis=0)) * wave).mean(axis=0) for v in (wanted, *map(T.points.smoothed, (B, wanted)))
+    )
+    assert (blurred < 0.89 * there).all() and (np.abs(sharp / there - 1) < 0.05).all()
 
 
 def test_a_laser_is_as_bright_as_sampled_within_3_percent() -> None:
