@@ -64,10 +64,12 @@ def rays_by(sensor: mi.Sensor, sampler: mi.Sampler) -> tuple[mi.Ray3f, mi.Spectr
     border = film.rfilter().border_size() if film.sample_border() else 0
     n = int(dr.prod(size)) * spp
     index, width = dr.arange(mi.UInt32, n) // dr.opaque(mi.UInt32, spp), dr.opaque(mi.UInt32, int(size[0]))
-    pixel = mi.Vector2i(index % width, index // width) - border + mi.Vector2i(film.crop_offset())
-    position = mi.Vector2f(pixel) + sampler.next_2d()
-    scale = 1 / mi.ScalarVector2f(film.crop_size())
+    first, scale = film.crop_offset() - border, 1 / mi.ScalarVector2f(film.crop_size())
     offset = -mi.ScalarVector2f(film.crop_offset()) * scale
+    first, scale, offset = (mi.Vector2i(first), mi.Vector2f(scale), mi.Vector2f(offset))
+    dr.make_opaque(first, scale, offset)  # a kernel then serves all crops
+    pixel = mi.Vector2i(index % width, index // width) + first
+    position = mi.Vector2f(pixel) + sampler.next_2d()
     aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
     time = sensor.shutter_open()
     if sensor.shutter_open_time() > 0:
