@@ -91,7 +91,7 @@ def _class(variant: str) -> type:
             """
             check_parameters(scene)
             check_emitters(scene)
-            with dr.suspend_grad():
+            with undisturbed(), dr.suspend_grad():
                 return self._prepared(scene, samples)
 
         def _prepared(self, scene: mi.Scene, samples: int = 1) -> list[TranslucentObject]:

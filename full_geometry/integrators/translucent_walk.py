@@ -14,6 +14,7 @@ import mitsuba as mi
 from full_geometry.geometry.sensors import camera_rays, checked_samples, sampled_size, splat, widened
 from full_geometry.geometry.shape import SceneMark
 from full_geometry.geometry.snapshot import Snapshot, same_objects
+from full_geometry.integrators.bssrdf import undisturbed
 from full_geometry.integrators.gathering import light_state
 from full_geometry.integrators.walk_paths import FirstExits, LightVisitor, PathTracer
 from full_geometry.objects.inclusions import check_sensors
@@ -176,7 +177,7 @@ def _class(variant: str) -> type:
             """The image; `keep` is called with the first exits of each launch, which are stored for it."""
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             spp = checked_samples(sensor, spp)
-            with interruptible(), dr.suspend_grad():
+            with interruptible(), undisturbed(), dr.suspend_grad():
                 seed = int(mi.UInt32(seed)[0])
                 samples = spp * int(dr.prod(sampled_size(sensor.film())))
                 _render(self.tracer(scene, seed, samples, exits=keep is not None), sensor, seed, spp, keep)
@@ -190,7 +191,7 @@ def _class(variant: str) -> type:
             medium: mi.Medium | None = None,
             active: mi.Bool = True,
         ) -> tuple:
-            with dr.suspend_grad():
+            with undisturbed(), dr.suspend_grad():
                 seed = tuple(int(2**24 * sampler.next_1d()[0]) for _ in range(2))
                 known, light = self._kept
                 light = light if light is not None and known == light_state(scene) else None
@@ -204,7 +205,7 @@ def _class(variant: str) -> type:
             self, scene: mi.Scene, params: Any, sensor: mi.Sensor | int = 0, seed: mi.UInt32 | int = 0, spp: int = 0
         ) -> mi.TensorXf:
             """The derivative of the image along that of the parameters."""
-            with dr.suspend_grad():
+            with undisturbed(), dr.suspend_grad():
                 image = self._differentiable(scene, sensor, seed, spp)
                 with dr.resume_grad():
                     dr.forward_to(image)
@@ -219,7 +220,7 @@ def _class(variant: str) -> type:
             Args:
                 variables: arrays with gradients enabled; all their numbers change alike.
             """
-            with dr.suspend_grad():
+            with undisturbed(), dr.suspend_grad():
                 image, found = self._differentiable(scene, sensor, seed, spp), []
                 with dr.resume_grad():
                     for x in variables:
@@ -235,7 +236,7 @@ def _class(variant: str) -> type:
             seed: mi.UInt32 | int = 0, spp: int = 0,
         ) -> None:  # fmt: skip
             """Add to the gradients of parameters what that of the image, `grad_in`, makes of them."""
-            with dr.suspend_grad():
+            with undisturbed(), dr.suspend_grad():
                 image = self._differentiable(scene, sensor, seed, spp)
                 with dr.resume_grad(), _one_thread():
                     dr.set_grad(image, grad_in)
@@ -251,7 +252,7 @@ def _class(variant: str) -> type:
             _check_followed(scene)
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             spp = checked_samples(sensor, spp)
-            with interruptible():
+            with interruptible(), undisturbed():
                 _render(self.tracer(scene, scored=True), sensor, int(mi.UInt32(seed)[0]), spp, None, True)
                 with dr.resume_grad():
                     return sensor.film().develop()

@@ -113,3 +113,14 @@ def test_a_rendered_scene_is_freed_with_its_last_name(model):
         numbers.append(int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(scene.shapes()[0]))[0]))
         del scene
     assert len(set(numbers)) == 1
+
+
+def test_no_garbage_is_collected_while_walks_are_recorded(monkeypatch):
+    """What it frees of earlier scenes gave a kernel the same function twice, of which LLVM ended the process."""
+    collects = []
+    monkeypatch.setattr(
+        "full_geometry.integrators.translucent_walk._render", lambda *_: collects.append(gc.isenabled())
+    )
+    walk = mi.load_dict({"type": "translucent_walk", "light": "sampled"})
+    walk.render(loaded("potato", "better_dipole"), spp=1, develop=False)
+    assert collects == [False] and gc.isenabled()
