@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -27,7 +26,7 @@ from full_geometry.precomputed.unscattered_light import (
     obstacle,
     unscattered_light,
 )
-from full_geometry.settings import OF_MITSUBA, WALK_LIGHTS, check_parameters
+from full_geometry.settings import MM_PER_UNIT, OF_MITSUBA, WALK_LIGHTS, check_parameters
 from full_geometry.surface.textured import shown
 from full_geometry.surface.varying import equivalent
 from full_geometry.surface.wrapped import surface_of
@@ -36,7 +35,7 @@ from full_geometry.walk.media import WalkMedia
 from full_geometry.walk.scores import PathScores, with_derivatives
 from full_geometry.walk.straight_light import find_straight_light
 from halfspace_sss.backend import clock
-from halfspace_sss.checks import check_choice
+from halfspace_sss.checks import check_choice, check_interval
 from halfspace_sss.interrupts import checkpoint, interruptible
 
 PARAMETERS = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters", "connection_share", "blur", "light", "layers")
@@ -80,7 +79,8 @@ def _class(variant: str) -> type:
         def __init__(self, props: mi.Properties) -> None:
             check_parameters("translucent_walk", props, (*PARAMETERS, *OF_MITSUBA))
             mi.SamplingIntegrator.__init__(self, props)
-            self.mm_per_unit = _positive("mm_per_unit", float(props.get("mm_per_unit", 1.0)))
+            self.mm_per_unit = float(props.get("mm_per_unit", 1.0))
+            check_interval("mm_per_unit", self.mm_per_unit, *MM_PER_UNIT)
             self.max_depth = _depth("max_depth", int(props.get("max_depth", -1)))
             self.rr_depth = _depth("rr_depth", int(props.get("rr_depth", 5)))
             self.hidden = bool(props.get("hide_emitters", False))
@@ -370,12 +370,6 @@ def _launch(
         keep(exits)
     layer = list(mi.Color3f(weight * emission)) if tracer.layers else []
     splat(sensor.film(), rays, weight * L, seen, position, spp, layer)
-
-
-def _positive(name: str, value: float) -> float:
-    if not (math.isfinite(value) and value > 0):
-        raise ValueError(f"{name} must be finite and > 0, got {value!r}")
-    return value
 
 
 def _scale(name: str, value: float) -> float:

@@ -25,11 +25,13 @@ from full_geometry.geometry.shape import Geometry, analyse_shape, check_together
 from full_geometry.objects.inclusions import Inclusion, find_inclusions, refracts
 from full_geometry.objects.objects import TranslucentObject, translucent_shapes
 from full_geometry.objects.small_emitters import is_delta
+from full_geometry.settings import MM_PER_UNIT
 from full_geometry.surface.translucent import MediumSpec, is_rough, is_smooth_boundary, smooth_boundary
 from full_geometry.surface.varying import VaryingMedium, eval_volume
 from full_geometry.surface.wrapped import Wrapping, surface_of, wrapping_of
 from full_geometry.walk.emission import unmasked_surface
 from full_geometry.walk.priorities import Priorities
+from halfspace_sss.checks import check_interval
 from halfspace_sss.physics.medium import Medium
 
 # ---- Shapes, media and lights inside objects ------------------------------------------------------------------------
@@ -652,11 +654,10 @@ class WalkMedia:
         """The objects of a scene whose surface is `translucent`.
 
         Raises:
-            ValueError: mm_per_unit is not a finite number > 0, an object is a sheet, the medium of an instance varies
-                in space, or as `InclusionTable.of`.
+            ValueError: mm_per_unit is out of range, an object is a sheet, the medium of an instance varies in space,
+                or as `InclusionTable.of`.
         """
-        if not (np.isfinite(mm_per_unit) and mm_per_unit > 0):
-            raise ValueError(f"mm_per_unit must be finite and > 0, got {mm_per_unit!r}")
+        check_interval("mm_per_unit", mm_per_unit, *MM_PER_UNIT)
         # ---- the geometry of each shape, and whether its medium can be there
         shapes, shown = translucent_shapes(scene), shown_groups(scene)
         instance_table, objects = InstanceTable.of(shapes, shown), [analyse_shape(shape, scene) for shape in shapes]

@@ -32,6 +32,7 @@ PLUGINS = [
     ({"type": "bssrdf", "model": "path_traced"}, WALKS),
     ({"type": "bssrdf", "entrys": 3}, "parameter of bssrdf must be .*got 'entrys'"),
     ({"type": "bssrdf", "mm_per_unit": -1.0}, "mm_per_unit must be .*got -1.0"),
+    ({"type": "translucent_walk", "mm_per_unit": 3e12}, r"mm_per_unit must be .*got 3000000000000.0"),
     ({"type": "translucent_walk", "entries": 3}, "parameter of translucent_walk must be .*got 'entries'"),
     ({"type": "translucent_walk", "connection_share": 2.0}, "connection_share must be .*got 2.0"),
     ({"type": "translucent_walk", "blur": -1.0}, "blur must be .*got -1.0"),
