@@ -102,7 +102,7 @@ UNKNOWN_TO_MODELS = {
 
 
 @pytest.mark.parametrize("wanted", UNKNOWN_TO_MODELS)
-def test_a_tinted_or_rough_boundary_is_refused_by_every_way_but_walks_which_trace_it(wanted: str) -> None:
+def test_a_tinted_or_rough_boundary_is_refused_by_every_way_but_walks_and_what_they_correct(wanted: str) -> None:
     inner = UNKNOWN_TO_MODELS[wanted]
     bsdf = {"type": "translucent", "sigma_s": 1.0, "sigma_a": 0.5, "eta": 1.4, "inner": inner}
     described = {
@@ -112,11 +112,15 @@ def test_a_tinted_or_rough_boundary_is_refused_by_every_way_but_walks_which_trac
     }
     loaded = mi.load_dict(described)
     asked = [{"model": way.model, "light": way.light} for way in techniques() if not way.walks]
+    corrected = [each for each in asked if each["light"] == "corrected"]
+    asked = [each for each in asked if each not in corrected]
     asked += [{"model": "auto"}, {"light": "auto"}, *({"orders": orders} for orders in ("single", "multiple"))]
     preparations = [mi.load_dict({"type": "bssrdf", **each}).prepare for each in asked]
     for ask in (*preparations, lambda scene: object_of(scene, None, 1.0)):
         with pytest.raises(ValueError, match=f"boundary of object 'ball' must be {wanted} under a model, got a .*walk"):
             ask(loaded)
+    for each in corrected:
+        mi.load_dict({"type": "bssrdf", **each}).check(loaded)
     mi.load_dict({"type": "translucent_walk"}).tracer(loaded)
 
 
