@@ -55,7 +55,7 @@ def parts(quality: str) -> list[Part]:
         inputs = (environment_file(LIGHT), TISSUES)
         ours = {TRUTH: OURS_SPP[quality][TRUTH], FULL_GEOMETRY: OURS_SPP[quality]["model"]}
         for method, spp in {**ours, **RIVALS_SPP[quality]}.items():
-            params, work, needs = {**common, "spp": spp, "model": method}, spp * size**2, ()
+            params, work, needs = {**common, "spp": spp, "model": method, "light": "gathered"}, spp * size**2, ()
             function = {DENG: deng, TG: distant}.get(method, shown)
             if method == DENG:
                 params |= {"photographs": PHOTOGRAPHS[quality], "steps": STEPS[quality], "step spp": STEP_SPP[quality]}
