@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from full_geometry.geometry.sensors import camera_rays
+from full_geometry.scenes.scene_files import like, put
 from full_geometry.surface.textured import linear_of_srgb
 from halfspace_sss.checks import check_choice, check_count, did_you_mean
 from halfspace_sss.provenance import read_text
@@ -224,14 +225,11 @@ def check_views(scene: mi.Scene, views: Sequence[GivenView], shape: mi.Shape) ->
 def edit(scene: mi.Scene, view: GivenView) -> None:
     """Bring a scene to what its edits say of a view."""
     if view.edits:
-        parameters = mi.traverse(scene)
-        for key, value in _edited(parameters, view).items():
-            parameters[key] = value
-        parameters.update()
+        put(scene, _edited(mi.traverse(scene), view), list(view.edits))
 
 
 def _edited(parameters: mi.SceneParameters, view: GivenView) -> dict[str, Any]:
-    """Values of edits in the types of a scene, as data of kernels."""
+    """Values of edits in the types of a scene."""
     result = {}
     for key, value in view.edits.items():
         name = f"{key} in edits of {view.name}"
@@ -239,9 +237,7 @@ def _edited(parameters: mi.SceneParameters, view: GivenView) -> dict[str, Any]:
         if old is None or not (isinstance(old, float) or dr.is_float_v(old)):
             near = did_you_mean(key, list(parameters.keys()))
             raise ValueError(f"{name} must be the key of numbers of the scene{near}")
-        numbers = numbers_of(name, value, np.size(old))
-        result[key] = type(old)(numbers if len(numbers) > 1 else numbers[0])
-        dr.make_opaque(result[key])
+        result[key] = like(old, np.array(numbers_of(name, value, np.size(old))))
     return result
 
 

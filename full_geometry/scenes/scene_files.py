@@ -1,4 +1,4 @@
-"""Scenes from dicts and XML files, with model, orders and integrator replaced where asked for.
+"""Scenes from dicts and XML files, with model, orders and integrator replaced where asked for, and edited later.
 
 What Mitsuba raises is brought down to its first cause: errors of plugins come wrapped, with tracebacks inside.
 """
@@ -12,8 +12,11 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from full_geometry.geometry.points import floats
 from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.scenes.gltf import SUFFIXES, gltf_scene, is_gltf
 from full_geometry.settings import LIGHTS, ORDERS, PATH_TRACED, SHARED, WALK_LIGHTS, check_variant
@@ -412,3 +415,30 @@ def _set_integrator(props: mi.Properties, plugin: str) -> None:
     for key in list(props.keys()):
         if key not in SHARED:
             del props[key]
+
+
+def put(scene: mi.Scene, values: Mapping[str, Any], keys: list[str]) -> None:
+    """Give parameters values that are data of kernels: literals would be code, compiled anew for each other value."""
+    parameters = mi.traverse(scene)
+    for key in keys:
+        value = type(values[key])(values[key])
+        dr.make_opaque(value)
+        parameters[key] = value
+    parameters.update()
+
+
+def like(old: object, value: np.ndarray) -> object:
+    """Numbers as a parameter of the same type as another."""
+    if isinstance(old, float):
+        return float(value.item())
+    if is_pose(old):
+        scalar = mi.ScalarTransform4f if len(value) == 4 else mi.ScalarTransform3f
+        return type(old)(scalar(value))
+    if dr.is_tensor_v(old):
+        return type(old)(value.astype(np.float32))
+    return type(old)(floats(value)) if dr.is_dynamic_v(old) and dr.depth_v(old) == 1 else type(old)(value.tolist())
+
+
+def is_pose(value: object) -> bool:
+    """Whether a parameter is a transformation: arrays take any name for components."""
+    return not dr.is_array_v(value) and hasattr(value, "matrix")

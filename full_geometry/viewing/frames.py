@@ -18,11 +18,10 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from full_geometry.geometry.points import floats
 from full_geometry.geometry.snapshot import plain
 from full_geometry.scenes.reference import loaded
-from full_geometry.scenes.scene_files import first_cause, open_scene
-from full_geometry.viewing.live import image_of, put
+from full_geometry.scenes.scene_files import first_cause, is_pose, like, open_scene, put
+from full_geometry.viewing.live import image_of
 from halfspace_sss.checks import check_count, did_you_mean
 
 Rows = Sequence[Mapping[str, ArrayLike]] | Mapping[str, Sequence[ArrayLike]]
@@ -111,7 +110,7 @@ class Animation:
             values |= self._moved(key, row[key])
         parameters = mi.traverse(self.scene)
         try:
-            put(self.scene, {key: _like(parameters[key], value) for key, value in values.items()}, list(values))
+            put(self.scene, {key: like(parameters[key], value) for key, value in values.items()}, list(values))
         except (RuntimeError, ValueError) as error:
             raise ValueError(f"frame {k + 1}: {first_cause(error)}") from error
         self._shown |= changed
@@ -162,7 +161,7 @@ def _complete(rows: Rows) -> list[dict[str, ArrayLike]]:
 
 def _is_number(key: str, value: object) -> bool:
     """Whether a parameter is real numbers or a transformation, but for the index, which kernels have as it is."""
-    return ".boundary." not in key and (isinstance(value, float) or _is_pose(value) or dr.is_float_v(value))
+    return ".boundary." not in key and (isinstance(value, float) or is_pose(value) or dr.is_float_v(value))
 
 
 def _numbers(name: str, value: ArrayLike, old: object) -> np.ndarray:
@@ -188,20 +187,3 @@ def _numbers(name: str, value: ArrayLike, old: object) -> np.ndarray:
     if size == 0 or old is None and size < 0 or shape == (4, 4) and not np.array_equal(found[3], (0, 0, 0, 1)):
         raise ValueError(f"{name} must be an invertible matrix by rows that mirrors no mesh, got {value!r}")
     return found
-
-
-def _is_pose(value: object) -> bool:
-    """Whether it is a transformation: arrays take any name for components."""
-    return not dr.is_array_v(value) and hasattr(value, "matrix")
-
-
-def _like(old: object, value: np.ndarray) -> object:
-    """Numbers as a value of the same type."""
-    if isinstance(old, float):
-        return float(value.item())
-    if _is_pose(old):
-        scalar = mi.ScalarTransform4f if len(value) == 4 else mi.ScalarTransform3f
-        return type(old)(scalar(value))
-    if dr.is_tensor_v(old):
-        return type(old)(value.astype(np.float32))
-    return type(old)(floats(value)) if dr.is_dynamic_v(old) and dr.depth_v(old) == 1 else type(old)(value.tolist())

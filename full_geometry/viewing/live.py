@@ -20,7 +20,7 @@ from full_geometry.objects.objects import translucent_shapes
 from full_geometry.scenes.gltf import is_gltf
 from full_geometry.scenes.reference import check_sensor
 from full_geometry.scenes.reference_store import Reference, finite_pixels
-from full_geometry.scenes.scene_files import first_cause, open_scene, parsed
+from full_geometry.scenes.scene_files import first_cause, open_scene, parsed, put
 from full_geometry.settings import OF_MITSUBA, PATH_TRACED, SHARED
 from full_geometry.surface.wrapped import surface_of
 from full_geometry.trade.denoising import Denoiser
@@ -266,16 +266,6 @@ def _brought(scene: mi.Scene, wanted: mi.Scene) -> bool:
         return False
     put(scene, mi.traverse(wanted), keys)
     return True
-
-
-def put(scene: mi.Scene, values: Mapping[str, Any], keys: list[str]) -> None:
-    """Give parameters values that are data of kernels: literals would be code, compiled anew for each other value."""
-    parameters = mi.traverse(scene)
-    for key in keys:
-        value = type(values[key])(values[key])
-        dr.make_opaque(value)
-        parameters[key] = value
-    parameters.update()
 
 
 def _of_light(scene: mi.Scene) -> list[str]:
