@@ -31,6 +31,7 @@ from full_geometry.integrators.surface_paths import exit_at, trace_paths
 from full_geometry.integrators.walk_paths import PathTracer
 from full_geometry.precomputed.surface_regression import ResidualSums, levels, smooth_field
 from full_geometry.precomputed.transport_matrix import bent
+from full_geometry.walk.random_walk import PATH_LANES
 from halfspace_sss.backend import clock
 from halfspace_sss.interrupts import checkpoint
 
@@ -41,7 +42,6 @@ if TYPE_CHECKING:
 PER_LAUNCH = 2**16  # walks
 FEWEST, MOST = 2**17, 2**22  # walks of an object
 SAMPLES_PER_WALK = 8  # of the image
-LANES = 2**14
 ROOTS = 0.8566748838545029, 0.7338918566271259, 0.6287067210378087, 0.5385972572236101, 0.46140152945534  # Roberts 2018
 LEAST_ALBEDO = 1e-6
 BRIGHTEST = 1 / 16384  # of the residuals of a launch, which are as bright as the next
@@ -200,7 +200,7 @@ def residuals(
     dr.eval(ray, out, met)
 
     # ---- W of a walk, and L_g = a B with orders 0 and 1
-    W, _, _ = tracer.trace(ray, LANES, (seed,))
+    W, _, _ = tracer.trace(ray, PATH_LANES, (seed,))
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, PER_LAUNCH)
     parts, *_ = trace_paths(scene, objects, settings, sampler, ray, mi.Bool(True))

@@ -32,6 +32,7 @@ from full_geometry.surface.varying import equivalent
 from full_geometry.surface.wrapped import surface_of
 from full_geometry.walk.emitter_connections import EmitterDirections, InnerLights, find_connections
 from full_geometry.walk.media import WalkMedia
+from full_geometry.walk.random_walk import PATH_LANES, on_device
 from full_geometry.walk.scores import PathScores, with_derivatives
 from full_geometry.walk.straight_light import find_straight_light
 from halfspace_sss.backend import clock
@@ -40,8 +41,6 @@ from halfspace_sss.interrupts import checkpoint, interruptible
 
 PARAMETERS = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters", "connection_share", "blur", "light", "layers")
 SAMPLES_PER_LAUNCH = 2**19
-LANES = 2**14  # fastest of 2**12 to 2**18 on 2 cores
-GPU_FACTOR = 4  # as many times lanes and samples on CUDA: 1.2 to 1.4 times as fast on an H200
 LAYER = ["emission.R", "emission.G", "emission.B"]
 SAMPLES_PER_RAY = 4  # of the image, for each ray of light: these take a tenth of the time or less
 SAMPLES_PER_PATH = 8  # the same for each path of scattered light, which takes as long as a few samples
@@ -197,7 +196,7 @@ def _class(variant: str) -> type:
                 light = light if light is not None and known == light_state(scene) else None
                 tracer = self.tracer(scene, seed[0], sampler.wavefront_size(), light=light)
                 rays = tracer.shown(widened(ray, sampler.wavefront_size()))
-                L, seen, emission = tracer.trace(rays, _on_device(LANES), seed)
+                L, seen, emission = tracer.trace(rays, on_device(PATH_LANES), seed)
             layer = list(mi.Color3f(emission)) if self.layers else []
             return dr.select(active, L, 0), active & seen, layer
 
@@ -335,15 +334,10 @@ def _render(
             inside.spectral.check_covers(obj.name, sensor)
     sensor.film().prepare(LAYER if tracer.layers else [])
     # launches are so small that their arrays fit, and that an interrupt is heard between them
-    most = max(1, _on_device(SAMPLES_PER_LAUNCH) // int(dr.prod(sampled_size(sensor.film()))))
+    most = max(1, on_device(SAMPLES_PER_LAUNCH) // int(dr.prod(sampled_size(sensor.film()))))
     for launch, start in enumerate(range(0, spp, most)):
         checkpoint()
         _launch(tracer, sensor, min(most, spp - start), (seed, launch), keep, scored)
-
-
-def _on_device(number: int) -> int:
-    """A number of lanes or samples for the device of the current variant."""
-    return number * GPU_FACTOR if mi.variant().startswith("cuda") else number
 
 
 def _launch(
@@ -358,14 +352,14 @@ def _launch(
         media = tracer.visitor.media
         with dr.resume_grad():
             scores = PathScores.of(media, dr.width(rays))
-        L, seen, _ = tracer.trace(rays, _on_device(LANES), seed, scores=scores)
+        L, seen, _ = tracer.trace(rays, on_device(PATH_LANES), seed, scores=scores)
         with dr.resume_grad():
             splat(sensor.film(), rays, with_derivatives(L, scores, media) * weight, seen, position, spp)
         return
 
     # ---- without, and with the layer of emission
     exits = FirstExits.of(tracer.visitor.scene, tracer.visitor.media, rays) if keep else None
-    L, seen, emission = tracer.trace(rays, _on_device(LANES), seed, exits)
+    L, seen, emission = tracer.trace(rays, on_device(PATH_LANES), seed, exits)
     if keep:
         keep(exits)
     layer = list(mi.Color3f(weight * emission)) if tracer.layers else []

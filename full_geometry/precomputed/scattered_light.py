@@ -27,15 +27,24 @@ import mitsuba as mi
 from full_geometry.geometry.points import opaque, sided
 from full_geometry.precomputed.lit_points import bend, lit_points
 from full_geometry.walk.media import WalkMedia
-from full_geometry.walk.random_walk import OUTSIDE, Crossing, Event, Walk, Walker, below, sample_bsdf, start_walk
+from full_geometry.walk.random_walk import (
+    OUTSIDE,
+    PATH_LANES,
+    Crossing,
+    Event,
+    Walk,
+    Walker,
+    below,
+    on_device,
+    sample_bsdf,
+    start_walk,
+)
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 if TYPE_CHECKING:
     from full_geometry.precomputed.inside_cells import CellIndex
 
 FEW = 3  # dragon of marble: 2, 3 and 5 have 20, 13 and 7 times less variance x time, ever less of the noise of cells
-LANES = 2**14
-GPU_FACTOR = 4  # as many times lanes on CUDA
 MOST_ADJOINT = 4.0
 AT_ONCE, CANDIDATES = 2**17, 2  # paths, and points with light for each of them
 ONWARD = 0.25  # share of walks that go on beyond FEW events where other surfaces than objects may send light
@@ -104,7 +113,7 @@ class ScatteredLight:
         """Walk from so many starts; lanes take those of index, index + lanes, ... until none is left."""
         dr.eval(starts)
         number, n = dr.width(starts[0]), len(mi.Spectrum(0))
-        lanes = min(LANES * GPU_FACTOR if mi.variant().startswith("cuda") else LANES, number)
+        lanes = min(on_device(PATH_LANES), number)
         total, step = (dr.opaque(mi.UInt32, v) for v in (number, lanes))
         walker = Walker(self.media, self)
 

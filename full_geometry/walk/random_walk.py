@@ -415,8 +415,15 @@ def draw(n: int, rng: mi.PCG32) -> mi.UInt32:
 #     ∫∫ S(x_i, w_i; x_o, w_o) mu_i f(x_i, w_i) dw_i dA_i = E[T f(x_i, w_i)].
 
 LANES = 2**15
+PATH_LANES = 2**14  # of paths from cameras and emitters: fastest of 2**12 to 2**18 on 2 cores
+GPU_FACTOR = 4  # as many times lanes and samples on CUDA: 1.2 to 1.4 times as fast on an H200
 ROULETTE_FROM = 8  # scattering events: from 2 on weak channels of ketchup have 10 times the variance, for no time less
 MOST = 2**31 - 1  # scattering events
+
+
+def on_device(number: int) -> int:
+    """A number of lanes or samples for the device of the current variant."""
+    return number * GPU_FACTOR if mi.variant().startswith("cuda") else number
 
 
 class WalkExits(NamedTuple):
