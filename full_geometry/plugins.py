@@ -67,12 +67,16 @@ def _register_all() -> None:
 
     from full_geometry.integrators.bssrdf import integrator_class
     from full_geometry.integrators.translucent_walk import walk_integrator_class
+    from full_geometry.surface.sheets import sheet_class
     from full_geometry.surface.translucent import translucent_class
     from full_geometry.transport.models import check_model, model_names
 
     def check(model: str) -> None:
         check_model(model, model_names())
 
-    mi.register_bsdf("translucent", lambda props: translucent_class()(props, check))
+    def surface(props: mi.Properties) -> mi.BSDF:
+        return sheet_class()(props) if "thickness" in props else translucent_class()(props, check)
+
+    mi.register_bsdf("translucent", surface)
     mi.register_integrator("bssrdf", lambda props: integrator_class()(props, _choose))
     mi.register_integrator("translucent_walk", walk_integrator_class())

@@ -142,6 +142,10 @@ def check_parameters(plugin: str, props: mi.Properties, known: Collection[str]) 
 
 
 AUTO = "auto"  # the cheapest model that keeps the tolerance, see `trade.automatic`
+NO_OBJECT = (
+    "the scene must have an object with a translucent BSDF, got none; surfaces with a thickness alone are rendered by "
+    "Mitsuba's path"
+)
 PATH_TRACED = "path_traced"  # stands for walks by `translucent_walk` where a model is named
 
 

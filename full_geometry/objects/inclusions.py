@@ -15,6 +15,7 @@ import numpy as np
 
 from full_geometry.geometry.instances import InstanceTable, corners, ends_of, shapes_of, shown_groups
 from full_geometry.geometry.shape import Geometry, is_inside, meet_alone, name_of, scene_of, ways_into
+from full_geometry.surface.sheets import is_sheet
 from full_geometry.surface.wrapped import surface_of
 
 STARTS = 64  # rays of each sensor that are looked at
@@ -56,7 +57,8 @@ def find_inclusions(scene: mi.Scene, objects: list[Geometry]) -> list[Inclusion]
     What shines or lets light through counts from the depth on that rays tell.
 
     Raises:
-        ValueError: the surface of such a shape lies on that of an object, so that rays do not tell which comes first.
+        ValueError: the surface of such a shape lies on that of an object, so that rays do not tell which comes first;
+            or it is a thin wall.
     """
     groups, results = shown_groups(scene), []
     holders = InstanceTable.of([obj.shape for obj in objects], groups)
@@ -75,6 +77,10 @@ def find_inclusions(scene: mi.Scene, objects: list[Geometry]) -> list[Inclusion]
             if partly and _tells(shape):
                 rows = [k for k, ij in enumerate(zip(pairs.i.tolist(), pairs.j.tolist())) if ij in partly]
                 _check_apart(pairs.some(rows), (shape, alone), holder, max(OVERLAP_LOOKS // len(rows), LOOKS))
+            if held and is_sheet(shape.bsdf()):
+                raise ValueError(
+                    f"a surface with a thickness must be outside of objects, got {name_of(shape)} inside {holder.name}"
+                )
             for i, j, whole in held:
                 for k in range(len(group.instances)) if i == EACH else (i,):
                     name = name_of(shape if group is None else group.instances[k])

@@ -19,7 +19,7 @@ import numpy as np
 from full_geometry.geometry.points import floats
 from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.scenes.gltf import SUFFIXES, gltf_scene, is_gltf
-from full_geometry.settings import LIGHTS, ORDERS, PATH_TRACED, SHARED, WALK_LIGHTS, check_variant
+from full_geometry.settings import LIGHTS, NO_OBJECT, ORDERS, PATH_TRACED, SHARED, WALK_LIGHTS, check_variant
 from full_geometry.surface.wrapped import surface_of
 from full_geometry.transport.models import model_names, of_objects
 from halfspace_sss.checks import check_choice, did_you_mean
@@ -116,7 +116,6 @@ def _is_ours(error: BaseException) -> bool:
 
 NO_MESHES = ("sphere", "disk", "cylinder", "sdfgrid", "bsplinecurve", "linearcurve", "instance", "shapegroup")
 _INTEGRATORS = {False: "bssrdf", True: "translucent_walk"}
-_NO_OBJECT = "the scene must have an object with a translucent BSDF, got none"
 
 
 def load_scene(
@@ -192,7 +191,7 @@ def open_scene(
     _set_parameters(state, "bitmap", {"format": "variant"} if floats else {})
     loaded = _made(scene, state, config)
     if not any(map(surface_of, loaded.shapes())):
-        raise ValueError(_NO_OBJECT)
+        raise ValueError(NO_OBJECT)
     return loaded
 
 
@@ -237,7 +236,7 @@ def _surfaces(state: ParserState) -> list[mi.Properties]:
     """The parameters of all translucent surfaces."""
     results = [node.props for node in state.nodes if node.props.plugin_name() == "translucent"]
     if not results:
-        raise ValueError(_NO_OBJECT)
+        raise ValueError(NO_OBJECT)
     return results
 
 

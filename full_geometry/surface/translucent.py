@@ -35,6 +35,7 @@ Parameters, all optional but the medium:
     a BSDF inside: the boundary, a `dielectric` or `roughdielectric` with int_ior / ext_ior equal to the eta of the
         medium; by default smooth. A rough one takes `translucent_walk` or corrected light.
     reflection: whether the boundary reflects light, by default true.
+    thickness: mm; makes the surface a thin wall, see `surface.sheets`.
     priority: where objects or glass overlap, space belongs to the larger one, by default 0. An object that has one, or
         lies inside another in part, has its eta over the index of what is around all of them.
 

@@ -14,7 +14,7 @@ from full_geometry.objects.objects import KnowsUnit, millimetres, refuse_instanc
 from full_geometry.objects.small_emitters import is_delta
 from full_geometry.scenes.reference import check_sensor
 from full_geometry.scenes.scene_files import PATH_TRACED, load_objects
-from full_geometry.settings import AUTO, GATHERED_LIGHTS, check_variant
+from full_geometry.settings import AUTO, GATHERED_LIGHTS, NO_OBJECT, check_variant
 from full_geometry.transport.models import model_names
 from halfspace_sss.checks import check_choice, check_count, check_interval
 
@@ -176,7 +176,7 @@ def stage(scene: mi.Scene | dict[str, Any] | str | Path, parameters: dict[str, s
     loaded = scene if isinstance(scene, mi.Scene) else load_objects(scene, parameters)
     shapes = translucent_shapes(loaded)
     if not shapes:
-        raise ValueError("the scene must have an object with a translucent BSDF, got none")
+        raise ValueError(NO_OBJECT)
     check_sensor(loaded, 0)
     refuse_instances(loaded, shapes, "the trade")
     return Stage(loaded, shapes, *_settings(loaded))

@@ -10,6 +10,7 @@ import numpy as np
 
 from full_geometry.geometry.instances import (
     InstanceScene,
+    shapes_of,
     shown_groups,
 )
 from full_geometry.geometry.points import (
@@ -37,8 +38,9 @@ from full_geometry.objects.objects import (
     translucent_shapes,
     with_inclusions,
 )
-from full_geometry.settings import AUTO, AUTOMATIC, GATHERED_LIGHTS, Capabilities, Choices, Settings
+from full_geometry.settings import AUTO, AUTOMATIC, GATHERED_LIGHTS, NO_OBJECT, Capabilities, Choices, Settings
 from full_geometry.surface.medium_derivatives import DifferentiableTransport, MediumDerivatives
+from full_geometry.surface.sheets import check_sheets
 from full_geometry.surface.translucent import MediumSpec, check_boundary, is_smooth_boundary
 from full_geometry.surface.varying import equivalent, warn_of_means
 from full_geometry.surface.wrapped import surface_of
@@ -238,8 +240,9 @@ def make_objects(
         raise ValueError(f"light must be 'sampled' under a spectral variant, got {settings.light!r}")
     shapes = translucent_shapes(scene)
     if not shapes:
-        raise ValueError("the scene must have an object with a translucent BSDF, got none")
+        raise ValueError(NO_OBJECT)
     groups = shown_groups(scene)
+    check_sheets(shapes_of(scene, groups), settings.mm_per_unit)
     objects = [analyse_shape(shape, scene, groups) for shape in shapes]
     check_sensors(scene, objects)
     outer = with_inclusions(scene, objects, settings.mm_per_unit, _MODELS)

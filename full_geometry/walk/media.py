@@ -17,6 +17,7 @@ from full_geometry.geometry.instances import (
     bounds_of,
     corners,
     ends_of,
+    shapes_of,
     shown_groups,
 )
 from full_geometry.geometry.points import lift
@@ -25,7 +26,8 @@ from full_geometry.geometry.shape import Geometry, analyse_shape, check_together
 from full_geometry.objects.inclusions import Inclusion, find_inclusions, refracts
 from full_geometry.objects.objects import TranslucentObject, translucent_shapes
 from full_geometry.objects.small_emitters import is_delta
-from full_geometry.settings import MM_PER_UNIT
+from full_geometry.settings import MM_PER_UNIT, NO_OBJECT
+from full_geometry.surface.sheets import check_sheets
 from full_geometry.surface.translucent import MediumSpec, is_rough, is_smooth_boundary, smooth_boundary
 from full_geometry.surface.varying import VaryingMedium, eval_volume
 from full_geometry.surface.wrapped import Wrapping, surface_of, wrapping_of
@@ -654,12 +656,15 @@ class WalkMedia:
         """The objects of a scene whose surface is `translucent`.
 
         Raises:
-            ValueError: mm_per_unit is out of range, an object is a sheet, the medium of an instance varies in space,
-                or as `InclusionTable.of`.
+            ValueError: mm_per_unit is out of range, there is no object, one is a sheet, the medium of an instance
+                varies in space, or as `InclusionTable.of` and `check_sheets`.
         """
         check_interval("mm_per_unit", mm_per_unit, *MM_PER_UNIT)
         # ---- the geometry of each shape, and whether its medium can be there
         shapes, shown = translucent_shapes(scene), shown_groups(scene)
+        check_sheets(shapes_of(scene, shown), mm_per_unit)
+        if not shapes:
+            raise ValueError(NO_OBJECT)
         instance_table, objects = InstanceTable.of(shapes, shown), [analyse_shape(shape, scene) for shape in shapes]
         inner = instance_table.scene(scene)
         for obj, group in zip(objects, instance_table.groups):

@@ -169,6 +169,103 @@ def _slab_fluxes(albedo: float, g: float, tau: float, eta: float, eta_slide: flo
     )  # fmt: skip
 
 
+class SlabKernels(NamedTuple):
+    """How light of each direction is scattered by a slab, as kernels between internal cosines.
+
+    The radiance outside along mu_o under irradiance E along mu_i is F_t(mu_i) F_t(mu_o) / eta² times E times a kernel.
+    """
+
+    mu: np.ndarray  # rising, inside
+    reflected: np.ndarray  # of two events or more, or with reflections inside, 1/sr, by azimuth, exit and entry
+    transmitted: np.ndarray
+    reflectance: np.ndarray  # fraction of entered flux that leaves upwards scattered, by entry, all orders
+    transmittance: np.ndarray
+    straight: float  # optical thickness for light that passes unscattered; of delta-M
+
+
+def slab_kernels(
+    albedo: float, g: float, tau: float, eta: float, azimuths: np.ndarray, orders: int, nodes: int = NODES
+) -> SlabKernels:
+    """How a slab in air scatters, without light scattered once that no boundary reflects inside, which has formulas.
+
+        K_r = a p (1 - exp(-t (1/mu_i + 1/mu_o))) / (mu_i + mu_o),
+        K_t = a p (exp(-t / mu_o) - exp(-t / mu_i)) / (mu_o - mu_i),   cosines inside, p of the phase function, 1/sr
+
+    is what is left out. All of it enters `reflectance` and `transmittance`.
+
+    Args:
+        albedo, g, tau, eta, nodes: as of `slab_fluxes`.
+        azimuths: between the directions of travel.
+        orders: of the Fourier series over azimuth.
+    """
+    with one_blas_thread():
+        return _slab_kernels(min(albedo, LARGEST_SLAB_ALBEDO), g, tau, eta, (azimuths, orders), nodes)
+
+
+def _slab_kernels(
+    albedo: float, g: float, tau: float, eta: float, series: tuple[np.ndarray, int], nodes: int
+) -> SlabKernels:
+    azimuths, orders = series
+    first, basis = _modes(albedo, g, eta, nodes), _basis(eta, nodes)
+    t, mu = tau * (1 - albedo * g**nodes), basis.mu
+    F = F_r(mu, 1 / eta)
+    i, o, E = mu[None], mu[:, None], np.exp(-t / mu)
+    entering = np.diag(1 / (2 * np.pi * mu * basis.w))  # each node alone is lit by flux 1
+    straight = np.diag(entering) * E / (1 - (F * E) ** 2)
+    leaving, reflected, transmitted = 2 * np.pi * basis.w * mu * (1 - F), 0.0, 0.0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        back = -np.expm1(-t * (1 / i + 1 / o)) / (i + o)
+        across = np.where(i == o, t * E / (i * o), (np.exp(-t / o) - np.exp(-t / i)) / (o - i))
+    for order in range(orders):
+        P = _associated_legendre(mu, order, nodes)
+        m = first if order == 0 else _azimuthal_modes(P, order, first.a_beta, basis)
+        down, up, far = (m.s + m.d) / 2, (m.s - m.d) / 2, np.exp(-m.k * t)
+        lit, dark = down - F[:, None] * up, (up - F[:, None] * down) * far
+        both, odd = np.linalg.solve(lit + dark, entering), np.linalg.solve(lit - dark, entering)
+        a, b = (both + odd) / 2, far[:, None] * (both - odd) / 2
+        # without what passes unscattered
+        upwards = up @ a + down @ b - np.diag(F * E * straight)
+        downwards = down @ (far[:, None] * a) + up @ (both - odd) / 2 - np.diag(straight)
+        if order == 0:
+            R, T = leaving @ upwards, leaving @ downwards
+        # without light scattered once
+        signs = (-1.0) ** (np.arange(nodes) + order)
+        ahead, behind = ((P * (m.a_beta * sign)) @ P.T / (4 * np.pi) for sign in (1, signs))
+        wave = (1 if order == 0 else 2) * np.cos(order * np.asarray(azimuths))[:, None, None]
+        reflected, transmitted = (
+            reflected + wave * (upwards - behind * back),
+            transmitted + wave * (downwards - ahead * across),
+        )
+    some = np.flatnonzero(F < 1)
+    reflected, transmitted = (each[:, some][:, :, some] for each in (reflected, transmitted))
+    return SlabKernels(mu[some], reflected, transmitted, R[some], T[some], t)
+
+
+def _associated_legendre(mu: np.ndarray, m: int, n: int) -> np.ndarray:
+    """sqrt((l - m)! / (l + m)!) P_l^m for l < n, one a column; 0 for l < m."""
+    result = np.zeros((len(mu), n))
+    result[:, m] = np.prod([math.sqrt((2 * k - 1) / (2 * k)) for k in range(1, m + 1)]) * (1 - mu * mu) ** (m / 2)
+    for k in range(m, n - 1):
+        before = math.sqrt(k * k - m * m) * result[:, k - 1] if k > m else 0.0
+        result[:, k + 1] = ((2 * k + 1) * mu * result[:, k] - before) / math.sqrt((k + 1) ** 2 - m * m)
+    return result
+
+
+def _azimuthal_modes(P: np.ndarray, order: int, a_beta: np.ndarray, basis: _Basis) -> _Modes:
+    """Modes of radiance that goes as cos(order phi), order > 0, from `_associated_legendre` of the order."""
+    root, n = np.sqrt(basis.w)[:, None] * P, len(basis.mu)
+    even, odd = root[:, order % 2 :: 2], root[:, 1 - order % 2 :: 2]
+    # A - B = V^-½ F F^T V^½ and A + B = V^-½ G G^T V^½
+    of_even, of_odd = a_beta[order % 2 :: 2], a_beta[1 - order % 2 :: 2]
+    F, G = (
+        np.linalg.cholesky(np.eye(n) - (part * of) @ part.T) / np.sqrt(basis.mu)[:, None]
+        for part, of in ((even, of_even), (odd, of_odd))
+    )
+    X, k, Y = np.linalg.svd(G.T @ F)
+    scale = 1 / np.sqrt(basis.w * basis.mu)[:, None]
+    return _Modes(scale * (G @ X), scale * (F @ Y.T), k, a_beta)
+
+
 def _slide_reflectance(mu: np.ndarray, eta: float, eta_slide: float) -> np.ndarray:
     """Of a boundary with a slide, for light from within the medium at the cosines mu."""
     inner = F_r(mu, eta_slide / eta)
