@@ -24,13 +24,17 @@ from halfspace_sss.executors import completed
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.interface.query import Query
 from halfspace_sss.maps.noisy_maps import draw_directions, make_pool, radial_edges
-from halfspace_sss.neural.features import N_FEATURES
-from halfspace_sss.neural.hypernetwork import in_range
-from halfspace_sss.neural.network import RELU, SILU, Network, layer_shapes
+from halfspace_sss.neural.network import N_FEATURES, RELU, SILU, Network, layer_shapes
 from halfspace_sss.neural.paper_model import N_INPUTS, T_SMALLEST, NeuralPaper, query_inputs
 from halfspace_sss.neural.training.fit import fit
-from halfspace_sss.neural.training.learners import PaperLearner, apply_networks, initial_numbers, relative_loss
-from halfspace_sss.neural.training.pool import Batch, MapPool
+from halfspace_sss.neural.training.learners import (
+    Batch,
+    MapPool,
+    PaperLearner,
+    apply_networks,
+    initial_numbers,
+    relative_loss,
+)
 from halfspace_sss.neural.training.train_material import (
     BLOCK,
     STANDARD,
@@ -40,6 +44,7 @@ from halfspace_sss.neural.training.train_material import (
     PaperTraining,
     Trial,
 )
+from halfspace_sss.neural.universal import in_range
 from halfspace_sss.physics.backbone import backbone, length_scale, unwarp
 from halfspace_sss.physics.fresnel import F_t
 from halfspace_sss.physics.medium import Medium, check_scalar_medium

@@ -25,7 +25,7 @@ from halfspace_sss.physics.fresnel import F_r, F_t
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.physics.reflectance import _inverse
 from halfspace_sss.registry import bssrdf, models
-from halfspace_sss.tracing.tallies import AngularTally, FluxTally
+from halfspace_sss.tracing.passes import AngularTally, FluxTally
 from halfspace_sss.tracing.walk import Tally, pass_seed, walk
 
 MEDIA = ((0.75, 0.0, 1.3), (0.99, 0.0, 1.5), (0.999, 0.9, 1.3))

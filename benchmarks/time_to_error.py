@@ -1,7 +1,7 @@
 """CPU seconds from a fresh scene to a total error of denoised path tracing, at kernels that are known.
 
 Passes grow. Whenever the samples have grown by what the last errors ask for, by half at least, the halves are denoised
-and compared (`full_geometry.scenes.cross_denoising`), for pixels and for means over blocks of 8 x 8. No reference is
+and compared (`full_geometry.scenes.reference`), for pixels and for means over blocks of 8 x 8. No reference is
 rendered: the error is estimated without bias from the halves, but for the bias of precomputed light, below .3 %. The
 time of raw path tracing follows from its variance. Ways are walks with precomputed light and Mitsuba's `volpathmis`.
 """
@@ -21,7 +21,7 @@ from benchmarks.speeds import VOLUMES, LitObject
 from benchmarks.total_error import BLOCK, PRECOMPUTED, image_of_pass, lit_scene
 from figures.computing.scans import prepare
 from figures.parts.part import Row
-from full_geometry.scenes.cross_denoising import Denoise, Halves
+from full_geometry.scenes.reference import Denoise, Halves
 from full_geometry.scenes.reference_store import Reference
 from full_geometry.trade.denoising import Denoiser
 

@@ -27,7 +27,7 @@ from benchmarks.speeds import VOLUMES, LitObject
 from figures.computing.contenders import ready
 from figures.computing.scans import prepare
 from figures.parts.part import Row
-from full_geometry.scenes.cross_denoising import cross_denoised
+from full_geometry.scenes.reference import cross_denoised
 from full_geometry.scenes.reference_store import Reference
 from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
 from full_geometry.trade.denoising import Denoiser, cover

@@ -114,7 +114,7 @@ def turned(task: Task) -> dict[str, object]:
     """What the knobs bring on a scene."""
     from benchmarks.knobs import channel_settings, entry_settings, node_settings, precision_settings
     from full_geometry.trade.techniques import stage
-    from halfspace_sss.neural.symmetric import channels
+    from halfspace_sss.neural.network import channels
 
     prepare()
     p = task.params

@@ -15,18 +15,14 @@ import typer
 import halfspace_sss
 from figures.parts.command import COMMANDS as FIGURES
 from full_geometry.cli.fit import fit
-from full_geometry.cli.render import render
+from full_geometry.cli.render import render, view
 from full_geometry.cli.trade import trade
 from full_geometry.cli.train import errors_object, train_object, train_shapes
 from full_geometry.cli.variants import Drawers
-from full_geometry.cli.view import view
-from halfspace_sss.cli.curves import curves
-from halfspace_sss.cli.errors import errors_materials, errors_truths
-from halfspace_sss.cli.lists import materials_import, materials_list, materials_show, models
-from halfspace_sss.cli.maps import maps
+from halfspace_sss.cli.curves import curves, materials_import, materials_list, materials_show, models
+from halfspace_sss.cli.errors import errors_materials, errors_truths, validate
 from halfspace_sss.cli.shared import Commands, add, group
-from halfspace_sss.cli.train import train_material, train_universal
-from halfspace_sss.cli.validate import validate
+from halfspace_sss.cli.train import maps, train_material, train_universal
 from halfspace_sss.extensions import COMMANDS, FAILURES, commands, warn_left_out
 
 if TYPE_CHECKING:

@@ -29,8 +29,7 @@ from halfspace_sss import backend
 from halfspace_sss.comparison import reflectance_curves
 from halfspace_sss.materials import catalogue as registry
 from halfspace_sss.neural import material_model, paper_model, store
-from halfspace_sss.neural.features import N_FEATURES
-from halfspace_sss.neural.network import layer_shapes
+from halfspace_sss.neural.network import N_FEATURES, layer_shapes
 from halfspace_sss.neural.store import save_weights
 
 QUICKLY = Path.home() / ".drjit" / "of_tests"  # kernels that are compiled as below, apart from those of users

@@ -112,7 +112,7 @@ def test_an_old_llvm_that_the_user_set_is_told_from_a_damaged_one() -> None:
     [
         "import full_geometry\nfull_geometry.register()\nimport mitsuba as mi\n"
         "mi.Bitmap(image).write('a.exr')\nassert np.array_equal(np.array(mi.Bitmap('a.exr')), image)",
-        "from figures.parts.store import exr_bytes, read_exr\n"
+        "from figures.parts.runner import exr_bytes, read_exr\n"
         "open('a.exr', 'wb').write(exr_bytes(image, 'a', 'test'))\nassert np.array_equal(read_exr('a.exr'), image)",
     ],
     ids=["rendering", "figures"],

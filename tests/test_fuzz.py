@@ -36,7 +36,7 @@ COMPUTES = [  # what is replaced: the properties are of what comes before the co
     "halfspace_sss.comparison.truths.validate", "halfspace_sss.comparison.model_truths.reflectance_truths",
     "full_geometry.scenes.reference.render",
     "figures.parts.runner.completed_plans",
-    "full_geometry.trade.flat.references", "full_geometry.trade.assessing.assess_stage",
+    "full_geometry.trade.advice.references", "full_geometry.trade.assessing.assess_stage",
     "full_geometry.trade.assessing.assess_for",
     "full_geometry.learning.shape_training._ShapeTraining", "full_geometry.learning.training._ObjectTraining",
     "full_geometry.learning.learners.errors_of", "full_geometry.inverse.fitting.MediumDescent",

@@ -15,7 +15,7 @@ from figures.parts.part import Result, SceneDict, Task
 from full_geometry.trade.denoising import check_denoiser, cover, denoised, guides
 from full_geometry.transport.models import model_names
 from halfspace_sss import bssrdf
-from halfspace_sss.neural.symmetric import channels
+from halfspace_sss.neural.network import channels
 from halfspace_sss.physics.medium import Medium
 
 if TYPE_CHECKING:

@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from figures.computing.scans import BUNNY, MM_PER_UNIT, SCANS, prepare, scan_scene
-from figures.modelling.candle import make_candle
-from figures.modelling.objects import candle_parts, learnable_parts, make_varying, tissue
+from figures.modelling.objects import candle_parts, learnable_parts, make_candle, make_varying, tissue
 from figures.parts.part import Part, Result, SceneDict, Task
 from halfspace_sss import bssrdf, materials, models
+from halfspace_sss.neural.network import channels
 from halfspace_sss.neural.store import weights_in
-from halfspace_sss.neural.symmetric import channels
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from figures.parts.part import SceneDict, Task
-from figures.parts.store import read_exr
+from figures.parts.runner import read_exr
 from halfspace_sss.checks import check_choice
 from halfspace_sss.provenance import check_folder
 

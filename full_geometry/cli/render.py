@@ -1,8 +1,9 @@
-"""The command `halfspace-sss render`: a Mitsuba scene with translucent objects, by any model or path traced."""
+"""The commands `render`, a scene with translucent objects by any model or path traced, and `view`, in the browser."""
 
 from __future__ import annotations
 
 import math
+import threading
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -10,8 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from full_geometry.cli.variants import Drawers, use_mitsuba
+from full_geometry.cli.variants import Drawers, SceneOptions, use_mitsuba
 from halfspace_sss.cli import shared
+from halfspace_sss.interrupts import interrupts
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -159,7 +161,7 @@ def _image(
     way: _Render, file: Path, images: ImageOptions, which: dict[str, Any], drawers: Drawers | None
 ) -> np.ndarray | None:
     """Render an image and write its files; None for a frame that is finished and gone on with."""
-    from full_geometry.scenes.cross_denoising import cross_denoised
+    from full_geometry.scenes.reference import cross_denoised
     from full_geometry.scenes.reference_store import Picture
     from full_geometry.trade.denoising import Denoiser
     from halfspace_sss.provenance import one_writer
@@ -410,3 +412,30 @@ def _error(reference: Reference, wanted: float = SMALL_ERROR) -> str:
         f"{told}; up to {share:.0%} of the variance is from light that scattered at most once inside and then hit an "
         "emitter by chance"
     )
+
+
+PORT = 8080
+
+
+def view(
+    scene: Annotated[Path, typer.Argument(help="Mitsuba XML or glTF file whose objects use the BSDF `translucent`.")],
+    options: SceneOptions,
+    host: Annotated[str, typer.Option(help="Address; another than a loopback one asks for a token.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="Port.")] = PORT,
+    side: Annotated[int, typer.Option(help="Root of the number of pixels.")] = 256,
+) -> None:
+    """Look at a scene in the browser: turn it, move its light, change media and models, until Ctrl-C.
+
+    The address is printed. Scenes are saved beside the file, and no file of another folder is read.
+    """
+    use_mitsuba(options.variant)
+    from full_geometry.viewing.page import Page
+
+    page = Page(scene, host, port, side**2, options.parameters())
+    try:
+        shared.say(f"{page.url}  (Ctrl-C ends)")
+        while not threading.Event().wait(0.2):
+            interrupts.check()
+            page.check()
+    finally:
+        page.close()

@@ -116,7 +116,7 @@ def _shipped() -> None:
 
 
 def _material(name: str, how: dict[str, Any], out: Path) -> None:
-    from full_geometry.trade.flat import recommend_flat
+    from full_geometry.trade.advice import recommend_flat
     from halfspace_sss import materials
     from halfspace_sss.provenance import provenance, write_together
 

@@ -18,8 +18,7 @@ from full_geometry.transport.features import Terms, entering, n_pair, reverse
 from full_geometry.transport.one_object import BOUND
 from full_geometry.transport.patches import Patches
 from halfspace_sss.checks import check_choice, check_count, check_interval
-from halfspace_sss.neural.training.fit import Descent, cosine, torch_threads, warm_up
-from halfspace_sss.neural.training.unfinished import gone_on_with, write_checkpoint
+from halfspace_sss.neural.training.fit import Descent, cosine, gone_on_with, torch_threads, warm_up, write_checkpoint
 from halfspace_sss.registry import models
 
 # ---- Where networks are fitted: beside the walks that are their data -------------------------------

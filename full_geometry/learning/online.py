@@ -25,7 +25,7 @@ from full_geometry.learning.learners import LearntObject, learner, learners
 from full_geometry.objects.objects import outermost, translucent_shapes
 from full_geometry.scenes import reference
 from full_geometry.scenes.camera_walks import CameraWalks
-from full_geometry.scenes.cross_denoising import Denoise
+from full_geometry.scenes.reference import Denoise
 from full_geometry.scenes.reference_store import BY_CHANCE, Reference, load, save
 from full_geometry.surface.wrapped import surface_of, wrapping_of
 from halfspace_sss.checks import check_count, check_interval

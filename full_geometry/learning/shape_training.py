@@ -37,8 +37,15 @@ from full_geometry.transport.descriptors import (
 from full_geometry.transport.exit_pairs import EntryProposals, trace_exits
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.neural.store import save_weights, to_json
-from halfspace_sss.neural.training.fit import Descent, cosine, warm_up
-from halfspace_sss.neural.training.unfinished import CHECKPOINT, claim, gone_on_with, write_checkpoint
+from halfspace_sss.neural.training.fit import (
+    CHECKPOINT,
+    Descent,
+    claim,
+    cosine,
+    gone_on_with,
+    warm_up,
+    write_checkpoint,
+)
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import check_folder, provenance, write_atomically

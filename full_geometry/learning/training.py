@@ -39,7 +39,7 @@ from full_geometry.transport.storing import frame_of, identify
 from halfspace_sss.backend import clock
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.neural.store import check_weights_folder, to_json
-from halfspace_sss.neural.training.unfinished import CHECKPOINT, claim
+from halfspace_sss.neural.training.fit import CHECKPOINT, claim
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import check_folder, provenance, write_atomically

@@ -15,7 +15,7 @@ import numpy as np
 
 from full_geometry.geometry.sensors import independent, seeded
 from full_geometry.objects.objects import translucent_shapes
-from full_geometry.scenes.cross_denoising import Halves
+from full_geometry.scenes.reference import Halves
 from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.trade.denoising import GUIDE_SPP, GUIDES, denoised, guides_of
 from full_geometry.trade.image_differences import mean_flip

@@ -17,7 +17,7 @@ import numpy as np
 from full_geometry.geometry.points import SurfacePoint, opaque, refract_in
 from full_geometry.objects.objects import TranslucentObject
 from full_geometry.transport.features import FirstEvent, first_event
-from halfspace_sss.neural.features import medium_features
+from halfspace_sss.neural.network import medium_features
 from halfspace_sss.physics.backbone import length_scale
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.tracing.walk import generator, pass_seed

@@ -56,8 +56,8 @@ from halfspace_sss import measure
 from halfspace_sss.arrays import broadcast_query
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.interface.query import Query
+from halfspace_sss.neural.network import SymmetricModel
 from halfspace_sss.neural.reduced import MODES, ReducedNetworks, shape_over_power
-from halfspace_sss.neural.symmetric import SymmetricModel
 from halfspace_sss.physics.fresnel import F_t
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.registry import bssrdf

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from halfspace_sss.arrays import library
-from halfspace_sss.neural.hypernetwork import RANGES
+from halfspace_sss.neural.universal import RANGES
 from halfspace_sss.physics.backbone import length_scale, unwarp, warp
 from halfspace_sss.physics.medium import Medium
 

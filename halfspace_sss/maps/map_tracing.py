@@ -16,8 +16,7 @@ from halfspace_sss.maps.grid import MapGrid, cell_edges, map_directions, radial_
 from halfspace_sss.physics.backbone import warp
 from halfspace_sss.physics.fresnel import F_t, mu_internal
 from halfspace_sss.physics.medium import Medium, eval_hg
-from halfspace_sss.tracing.passes import PATHS_PER_LANE
-from halfspace_sss.tracing.tallies import CellSums
+from halfspace_sss.tracing.passes import PATHS_PER_LANE, CellSums
 from halfspace_sss.tracing.walk import Scatter, Tally, at_lanes, pass_seed, walk
 
 GROUP = 16  # observations that share a walk

@@ -25,7 +25,7 @@ from halfspace_sss.physics.backbone import U_MAX, backbone, length_scale, unwarp
 from halfspace_sss.physics.medium import eval_hg
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import write_atomically
-from halfspace_sss.tracing.tallies import CellSums
+from halfspace_sss.tracing.passes import CellSums
 from halfspace_sss.tracing.walk import Scatter, WalkConstants, pass_seed, walk
 
 LANES, PER_LAUNCH = 32768, 256  # lanes and groups of one launch, at most
@@ -257,7 +257,7 @@ def make_pool(
 
     Args:
         groups, grid, events, seed, backend: as in `trace_groups`.
-        folder: that of this run, see `neural.training.unfinished`.
+        folder: that of this run, see `neural.training.fit`.
         progress: called with ("data", launches done, launches in all).
         executor: where launches run (see `halfspace_sss.executors`); by default in this process.
 

@@ -5,19 +5,22 @@ distances that carry flux, periodic trapezoids in both azimuths with the mirror 
 S depends on both azimuths, the reflectance is summed on a shifted lattice.
 """
 
-from halfspace_sss.measure.consistency import (
-    ReciprocityGap,
-    clamped_energy,
-    energy_table,
-    reciprocity_gap,
-    weight_variance,
-)
 from halfspace_sss.measure.quadrature import Quadrature
-from halfspace_sss.measure.reflected_flux import Integral, Moments, moments, profile, reflectance, reflectance_estimate
-from halfspace_sss.measure.spatial_frequency import (
+from halfspace_sss.measure.reflected_flux import (
+    Integral,
+    Moments,
+    ReciprocityGap,
     ReducedCoefficients,
+    clamped_energy,
     coefficients_of_frequencies,
+    energy_table,
     frequency_reflectance,
+    moments,
+    profile,
+    reciprocity_gap,
+    reflectance,
+    reflectance_estimate,
+    weight_variance,
 )
 
 __all__ = [

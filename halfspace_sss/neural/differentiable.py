@@ -12,11 +12,9 @@ import numpy as np
 
 from halfspace_sss.arrays import Lanes, Real, broadcast_query, is_torch, library
 from halfspace_sss.interface.query import Query
-from halfspace_sss.neural.features import medium_features, symmetric_features, travel
-from halfspace_sss.neural.hypernetwork import N_TERMS, Hypernetwork, Layers
+from halfspace_sss.neural.network import N_TERMS, log_calibrations, medium_features, symmetric_features, travel
 from halfspace_sss.neural.perceptron import Perceptron, cooperative, silu
-from halfspace_sss.neural.symmetric import log_calibrations
-from halfspace_sss.neural.universal import load_hypernetwork, shipped_weights
+from halfspace_sss.neural.universal import Hypernetwork, Layers, load_hypernetwork, shipped_weights
 from halfspace_sss.physics.backbone import backbone_shape, length_scale
 from halfspace_sss.physics.fresnel import F_t
 

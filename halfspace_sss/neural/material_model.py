@@ -6,10 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from halfspace_sss.neural.features import N_FEATURES
-from halfspace_sss.neural.network import SILU, Activation, Network, layer_shapes
+from halfspace_sss.neural.network import N_FEATURES, SILU, Activation, Network, SymmetricModel, channels, layer_shapes
 from halfspace_sss.neural.store import check_medium, find_weights, load_weights, record_count
-from halfspace_sss.neural.symmetric import SymmetricModel, channels
 from halfspace_sss.physics.medium import Medium
 
 KIND = "neural_material"

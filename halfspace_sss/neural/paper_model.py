@@ -9,9 +9,8 @@ from halfspace_sss.arrays import Library, Real
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.interface.query import Query
 from halfspace_sss.neural.material_model import load_network
-from halfspace_sss.neural.network import RELU, Network
+from halfspace_sss.neural.network import RELU, Network, channel_queries, channels
 from halfspace_sss.neural.store import find_weights, load_weights, record_number
-from halfspace_sss.neural.symmetric import channel_queries, channels
 from halfspace_sss.physics.backbone import U_MAX, length_scale
 from halfspace_sss.physics.fresnel import F_t, sine
 from halfspace_sss.physics.medium import Medium

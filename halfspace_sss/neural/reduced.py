@@ -29,10 +29,15 @@ import numpy as np
 
 from halfspace_sss.arrays import Lanes, Real, library
 from halfspace_sss.interface.query import Query
-from halfspace_sss.neural.features import symmetric_features, travel
-from halfspace_sss.neural.network import Network
+from halfspace_sss.neural.network import (
+    LOG_RANGE,
+    Network,
+    SymmetricModel,
+    log_calibrations,
+    symmetric_features,
+    travel,
+)
 from halfspace_sss.neural.perceptron import Perceptron
-from halfspace_sss.neural.symmetric import LOG_RANGE, SymmetricModel, log_calibrations
 from halfspace_sss.physics.backbone import backbone_shape, length_scale
 
 PLACES = 0.1, 0.9  # of the two networks among the models

@@ -20,8 +20,7 @@ import numpy as np
 from halfspace_sss.arrays import Lanes
 from halfspace_sss.checks import check_edges, check_finite, check_interval
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.tracing.passes import Estimate, Pass, estimate
-from halfspace_sss.tracing.tallies import CellSums, find_cell
+from halfspace_sss.tracing.passes import CellSums, Estimate, Pass, estimate, find_cell
 from halfspace_sss.tracing.walk import Boundary, Scatter, Tally
 
 LIGHT_SPEED = 0.299792458  # mm/ps, exact by the definition of the metre

@@ -22,8 +22,7 @@ from halfspace_sss.physics.fresnel import F_r, mu_internal
 from halfspace_sss.physics.layers import Layers
 from halfspace_sss.physics.medium import sample_hg
 from halfspace_sss.progress import Progress
-from halfspace_sss.tracing.passes import Estimate, checked_radii, estimate, walk_passes
-from halfspace_sss.tracing.tallies import BATCHES, CellSums, find_cell
+from halfspace_sss.tracing.passes import BATCHES, CellSums, Estimate, checked_radii, estimate, find_cell, walk_passes
 from halfspace_sss.tracing.walk import Boundary, generator, in_launches, roulette, turn
 
 LAYER_ORDERS = ("unscattered", "single", "multiple", "total")  # 0, 1, 2 or more events, and their sum

@@ -1,4 +1,9 @@
-"""A beam on a half-space, walked pass by pass: the loop behind every traced quantity, and its estimates."""
+"""A beam on a half-space, walked pass by pass: the loop behind every traced quantity, what it records, its estimates.
+
+Flux, moments, rings, angular reflectance and curves are recorded, in units of mean free paths. Sums over memory cells
+are kept as 64-bit fixed-point integers: integer addition is associative, so the result does not depend on the order in
+which threads add, and a run gives the same bits every time.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +15,187 @@ from typing import NamedTuple
 
 import numpy as np
 
+from halfspace_sss.arrays import Lanes
 from halfspace_sss.checks import check_choice, check_edges
 from halfspace_sss.physics.fresnel import F_t, mu_internal
 from halfspace_sss.physics.layers import Layers
-from halfspace_sss.physics.medium import Medium
+from halfspace_sss.physics.medium import Medium, eval_hg
 from halfspace_sss.progress import Progress
-from halfspace_sss.tracing.tallies import BATCHES, CellSums
-from halfspace_sss.tracing.walk import Tally, pass_seed, walk
+from halfspace_sss.tracing.walk import Boundary, Scatter, Tally, pass_seed, walk
+
+FIXED_POINT = 2.0**32  # quantum 2.3e-10 of a unit weight; a cell holds up to 4e9 unit weights
+BATCHES = 64  # independent groups of lanes, from whose spread the variance of a cell is taken
+
+
+def _split(order: Lanes, value: Lanes) -> tuple[Lanes, Lanes]:
+    """A value as (single, multiple) according to the scattering order."""
+    import drjit as dr
+
+    return dr.select(order == 1, value, 0.0), dr.select(order > 1, value, 0.0)
+
+
+class FluxTally(Tally):
+    """Flux through the boundary per entered flux: sums (single, multiple)."""
+
+    def __init__(self, types: ModuleType) -> None:
+        self.types = types
+
+    def start(self, lanes: int) -> tuple:
+        import drjit as dr
+
+        return (dr.zeros(self.types.Float, lanes), dr.zeros(self.types.Float, lanes))
+
+    def boundary(self, sums: tuple, event: Boundary) -> tuple:
+        return tuple(s + v for s, v in zip(sums, _split(event.order, event.weight)))
+
+
+class MomentTally(Tally):
+    """Flux times r², x and path length: sums (r² single, r² multiple, x single, ..., length multiple)."""
+
+    def __init__(self, types: ModuleType) -> None:
+        self.types = types
+
+    def start(self, lanes: int) -> tuple:
+        import drjit as dr
+
+        return tuple(dr.zeros(self.types.Float, lanes) for _ in range(6))
+
+    def boundary(self, sums: tuple, event: Boundary) -> tuple:
+        import drjit as dr
+
+        leaves = event.weight > 0
+        moments = (event.x * event.x + event.y * event.y, event.x, event.length)
+        values = [dr.select(leaves, event.weight * m, 0.0) for m in moments]
+        parts = [part for value in values for part in _split(event.order, value)]
+        return tuple(s + v for s, v in zip(sums, parts))
+
+
+class AngularTally(Tally):
+    """Radiance towards given outside directions integrated over the plane, without Fresnel factors.
+
+    At each event: weight p(d.d_o) exp(-z/mu_o') / (eta² mu_o'), for each direction (single, multiple).
+    """
+
+    def __init__(self, types: ModuleType, g: float, eta: float, mu_o: np.ndarray, delta_phi: np.ndarray) -> None:
+        import drjit as dr
+
+        self.types = types
+        self.g = g if g == 0 else dr.opaque(types.Float, g)
+        self.mu = np.array([max(float(mu_internal(m, eta)), 1e-9) for m in mu_o])
+        sine = np.sqrt(np.maximum(1 - self.mu**2, 0))
+        self.constants = [
+            tuple(dr.opaque(types.Float, v) for v in (s * math.cos(p), s * math.sin(p), m, 1 / m, 1 / (eta**2 * m)))
+            for s, p, m in zip(sine, delta_phi, self.mu)
+        ]
+
+    def start(self, lanes: int) -> tuple:
+        import drjit as dr
+
+        return tuple(dr.zeros(self.types.Float, lanes) for _ in range(2 * len(self.mu)))
+
+    def scatter(self, sums: tuple, event: Scatter) -> tuple:
+        import drjit as dr
+
+        out = []
+        for k, (ox, oy, mu, inverse_mu, scale) in enumerate(self.constants):
+            cosine = event.dx * ox + event.dy * oy - event.dz * mu
+            score = event.weight * scale * eval_hg(cosine, self.g) * dr.exp(-event.z * inverse_mu)
+            single, multiple = _split(event.order, score)
+            out += [sums[2 * k] + single, sums[2 * k + 1] + multiple]
+        return tuple(out)
+
+
+class CellSums:
+    """Fixed-point sums over cells, separately for each batch of lanes."""
+
+    def __init__(self, types: ModuleType, cells: int, batches: int = BATCHES) -> None:
+        import drjit as dr
+
+        self.cells, self.batches = cells, batches
+        self.UInt64 = types.UInt64
+        self.sums = dr.zeros(types.UInt64, cells * batches)
+        dr.eval(self.sums)
+
+    def add(self, value: Lanes, cell: Lanes, lane: Lanes, active: Lanes) -> None:
+        """Add value >= 0 to a cell of the batch of this lane."""
+        import drjit as dr
+
+        index = (lane % self.batches) * self.cells + cell
+        dr.scatter_add(self.sums, self.UInt64(value * FIXED_POINT + 0.5), index, active)
+
+    def result(self) -> np.ndarray:
+        """Sums as float64, shape (batches, cells)."""
+        return self.sums.numpy().reshape(self.batches, self.cells).astype(np.float64) / FIXED_POINT
+
+
+class RingTally(Tally):
+    """Flux through rings of the plane between consecutive radii; cells (order, ring)."""
+
+    def __init__(self, types: ModuleType, edges: np.ndarray) -> None:
+        self.n = len(edges) - 1
+        self.edges2 = types.Float(np.asarray(edges, dtype=np.float64) ** 2)
+        self.cells = CellSums(types, 2 * self.n)
+
+    def boundary(self, sums: tuple, event: Boundary) -> tuple:
+        ring, inside = find_cell(self.edges2, event.x * event.x + event.y * event.y)
+        cell = ring + (event.order > 1) * type(ring)(self.n)
+        self.cells.add(event.weight, cell, event.lane, inside & (event.weight > 0))
+        return sums
+
+
+class LineTally(Tally):
+    """Radiance of order >= 2 towards one outside direction, over cells of a sector about a line from the origin.
+
+    Cells are ring segments between consecutive radii within `half_width` radians of the azimuth `line_phi`.
+    Where the mirror y -> -y changes nothing (w_o in the plane of incidence) the mirrored sector counts too,
+    where rotation changes nothing (both directions normal) the whole ring.
+    """
+
+    def __init__(
+        self, types: ModuleType, angular: AngularTally, edges: np.ndarray, line_phi: float, half_width: float,
+        symmetry: str,
+    ) -> None:  # fmt: skip
+        import drjit as dr
+
+        self.angular, self.symmetry = angular, symmetry
+        line = abs(math.remainder(line_phi, 2 * math.pi)) if symmetry == "mirror" else line_phi
+        self.line, self.half_width = (dr.opaque(types.Float, v) for v in (line, half_width))
+        self.edges2 = types.Float(np.asarray(edges, dtype=np.float64) ** 2)
+        self.cells = CellSums(types, len(edges) - 1)
+        low, high = max(line - half_width, 0.0), min(line + half_width, math.pi)
+        self.angle = {"rotation": 2 * math.pi, "mirror": 2 * (high - low), "none": 2 * half_width}[symmetry]
+        self.areas = 0.5 * self.angle * np.diff(np.asarray(edges, dtype=np.float64) ** 2)
+
+    def scatter(self, sums: tuple, event: Scatter) -> tuple:
+        import drjit as dr
+
+        ox, oy, mu, inverse_mu, scale = self.angular.constants[0]
+        # connect the event with the surface along the refracted w_o: t = z / mu_o'
+        t = event.z * inverse_mu
+        x, y = event.x + t * ox, event.y + t * oy
+        cell, active = find_cell(self.edges2, x * x + y * y)
+        active &= event.order > 1
+        # keep what lies in the sector |psi - line| < half width
+        if self.symmetry != "rotation":
+            psi = dr.atan2(dr.abs(y) if self.symmetry == "mirror" else y, x)
+            off = psi - self.line
+            off = dr.abs(off - 2 * math.pi * dr.round(off / (2 * math.pi)))
+            active &= off < self.half_width
+        cosine = event.dx * ox + event.dy * oy - event.dz * mu
+        # score w p(d . d_o) exp(-t) / (eta² mu_o')
+        score = event.weight * scale * eval_hg(cosine, self.angular.g) * dr.exp(-t)
+        self.cells.add(score, cell, event.lane, active)
+        return sums
+
+
+def find_cell(edges: Lanes, value: Lanes) -> tuple[Lanes, Lanes]:
+    """Index of the interval of an ascending Dr.Jit table that holds the value, and whether one does."""
+    import drjit as dr
+
+    n = dr.width(edges)
+    upper = dr.binary_search(0, n, lambda i: dr.gather(type(edges), edges, i) <= value)
+    return dr.maximum(upper, 1) - 1, (upper > 0) & (upper < n)
+
 
 ORDERS = ("single", "multiple", "total")
 PATHS_PER_LANE, MAX_LANES = 64, 131072

@@ -19,8 +19,19 @@ from halfspace_sss.physics.medium import Medium, check_scalar_medium, medium_of
 from halfspace_sss.progress import Progress
 from halfspace_sss.tracing.instrument import Instrument, Readings, Recorder, transformed
 from halfspace_sss.tracing.layer_tracing import LayerTrace, trace_layers
-from halfspace_sss.tracing.passes import ORDERS, Estimate, checked_radii, estimate, order_sum, walk_passes
-from halfspace_sss.tracing.tallies import AngularTally, FluxTally, LineTally, MomentTally, RingTally
+from halfspace_sss.tracing.passes import (
+    ORDERS,
+    AngularTally,
+    Estimate,
+    FluxTally,
+    LineTally,
+    MomentTally,
+    RingTally,
+    checked_radii,
+    estimate,
+    order_sum,
+    walk_passes,
+)
 from halfspace_sss.tracing.walk import Tally, walk
 
 if TYPE_CHECKING:

@@ -37,7 +37,7 @@ from halfspace_sss.maps.noisy_maps import CellGrid, draw_directions, make_pool
 from halfspace_sss.neural.paper_model import paper_inputs
 from halfspace_sss.neural.training import train_material as training
 from halfspace_sss.neural.training.fit import Fit, fit
-from halfspace_sss.neural.training.pool import MapPool
+from halfspace_sss.neural.training.learners import MapPool
 from halfspace_sss.neural.training.train_material import MaterialRecipe
 from halfspace_sss.provenance import KeptRows
 

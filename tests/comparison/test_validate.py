@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from figures.app import app
 from halfspace_sss import Medium, trace
-from halfspace_sss.cli.validate import row_filter, summary
+from halfspace_sss.cli.errors import row_filter, summary
 from halfspace_sss.comparison.truths import Comparison, read_truths, trace_order, validate
 from halfspace_sss.physics import single_scattering
 

@@ -18,8 +18,7 @@ from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
 from figures.parts import part as parts_module
 from figures.parts.part import Part, Result, Task, code_hash, keys_of
-from figures.parts.runner import compute, draw, duration
-from figures.parts.store import exr_bytes, read_exr
+from figures.parts.runner import compute, draw, duration, exr_bytes, read_exr
 from halfspace_sss.comparison.style import paper, saved
 
 

@@ -11,7 +11,7 @@ igl = pytest.importorskip("igl")
 import mitsuba as mi  # noqa: E402
 
 from figures.computing import scans as scenes  # noqa: E402
-from figures.modelling import candle, objects  # noqa: E402
+from figures.modelling import objects  # noqa: E402
 from full_geometry.learning import meshes  # noqa: E402
 
 LOW, HIGH = 32, 64
@@ -25,7 +25,7 @@ def varying() -> dict[str, objects.Varying]:
 
 @pytest.fixture(scope="module")
 def made(varying: dict) -> dict[str, meshes.Mesh]:
-    return {**{name: each.mesh for name, each in varying.items()}, "candle": candle.make_candle(LOW).wax}
+    return {**{name: each.mesh for name, each in varying.items()}, "candle": objects.make_candle(LOW).wax}
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def media(varying: dict) -> dict[str, objects.Grid]:
 
 def vertices(name: str, seed: int) -> np.ndarray:
     if name == "candle":
-        return candle.make_candle(LOW, seed).wax.vertices
+        return objects.make_candle(LOW, seed).wax.vertices
     return objects.make_varying(name, LOW, 8, seed).mesh.vertices
 
 
@@ -107,7 +107,7 @@ def test_an_object_is_the_same_for_the_same_seed_and_another_for_another(chosen:
 
 @pytest.mark.parametrize("chosen", objects.OBJECTS)
 def test_another_resolution_changes_the_volume_by_less_than_2_percent(chosen: str, made: dict) -> None:
-    fine = candle.make_candle(HIGH).wax if chosen == "candle" else objects.make_varying(chosen, HIGH, 8).mesh
+    fine = objects.make_candle(HIGH).wax if chosen == "candle" else objects.make_varying(chosen, HIGH, 8).mesh
     assert made[chosen].volume == pytest.approx(fine.volume, rel=0.02)
 
 
@@ -115,16 +115,16 @@ def test_another_resolution_changes_the_volume_by_less_than_2_percent(chosen: st
 def test_the_flame_lies_inside_the_convex_hull_of_the_candle_but_outside_of_the_wax(seed: int) -> None:
     from scipy.spatial import Delaunay
 
-    found = candle.make_candle(LOW, seed)
+    found = objects.make_candle(LOW, seed)
     assert (Delaunay(found.wax.vertices[::5]).find_simplex(found.flame.vertices) >= 0).all()
     winding = igl.fast_winding_number(found.wax.vertices, found.wax.faces.astype(np.int64), found.flame.vertices)
     assert np.abs(winding).max() < 0.1
 
 
 def test_the_wick_does_not_touch_the_wax() -> None:
-    found = candle.make_candle(LOW)
-    drips = candle._drips(0)
-    assert candle.wax_distance(found.wick.vertices, 0, drips).min() > 0.02
+    found = objects.make_candle(LOW)
+    drips = objects._drips(0)
+    assert objects.wax_distance(found.wick.vertices, 0, drips).min() > 0.02
 
 
 @pytest.mark.parametrize("chosen", objects.VARYING)

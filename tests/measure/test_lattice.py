@@ -10,7 +10,7 @@ from halfspace_sss import BSSRDF, Medium, bssrdf, measure
 from halfspace_sss.comparison.model_truths import sampled_reflectance
 from halfspace_sss.measure.quadrature import Angles, cosine_nodes
 from halfspace_sss.measure.reflected_flux import MOST_SHIFTS, POINTS
-from halfspace_sss.neural.features import travel
+from halfspace_sss.neural.network import travel
 from halfspace_sss.physics.fresnel import C_1, F_t
 
 

@@ -11,8 +11,8 @@ import pytest
 from halfspace_sss import Medium, bssrdf, trace
 from halfspace_sss.comparison.model_truths import exits, sampled_reflectance
 from halfspace_sss.comparison.truths import Truth, read_truths
-from halfspace_sss.neural.hypernetwork import N_TERMS, calibration_terms, in_range, log_calibration
-from halfspace_sss.neural.universal import load_hypernetwork, shipped_weights
+from halfspace_sss.neural.network import N_TERMS, calibration_terms, log_calibration
+from halfspace_sss.neural.universal import in_range, load_hypernetwork, shipped_weights
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.fresnel import F_r, mu_internal
 

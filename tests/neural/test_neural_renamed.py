@@ -11,9 +11,8 @@ import pytest
 
 from halfspace_sss import Medium, bssrdf
 from halfspace_sss.neural import material_model, paper_model, store
-from halfspace_sss.neural.features import N_FEATURES
 from halfspace_sss.neural.material_model import load_network
-from halfspace_sss.neural.network import layer_shapes
+from halfspace_sss.neural.network import N_FEATURES, layer_shapes
 from halfspace_sss.neural.store import save_weights
 
 KIND = material_model.KIND

@@ -15,10 +15,8 @@ from safetensors.numpy import save
 
 from halfspace_sss import Medium
 from halfspace_sss.neural import paper_model
-from halfspace_sss.neural.features import N_FEATURES, N_MEDIUM
-from halfspace_sss.neural.hypernetwork import N_TERMS
 from halfspace_sss.neural.material_model import load_network
-from halfspace_sss.neural.network import layer_shapes
+from halfspace_sss.neural.network import N_FEATURES, N_MEDIUM, N_TERMS, layer_shapes
 from halfspace_sss.neural.store import LARGEST, load_weights, save_weights
 from halfspace_sss.neural.universal import load_hypernetwork
 

@@ -29,7 +29,7 @@ def _passes(truth: np.ndarray, sizes: list[int], noise: float, seed: int) -> Any
 
 @pytest.mark.parametrize("noise", [0.5, 4.0])
 def test_the_error_that_is_told_has_the_bias_of_the_denoiser_and_its_noise(noise: float) -> None:
-    from full_geometry.scenes.cross_denoising import cross_denoised
+    from full_geometry.scenes.reference import cross_denoised
 
     x, y = np.meshgrid(np.linspace(0, 6, 64), np.linspace(0, 6, 64))
     truth = np.repeat((1.2 + np.sin(x) * np.cos(2 * y))[..., None], 3, axis=2)
@@ -71,7 +71,7 @@ def test_halves_of_a_run_in_two_parts_are_those_of_a_run_in_one(tmp_path: Path) 
 
 def test_a_run_stops_at_the_error_of_its_denoised_image(tmp_path: Path) -> None:
     from full_geometry.scenes import reference
-    from full_geometry.scenes.cross_denoising import cross_denoised
+    from full_geometry.scenes.reference import cross_denoised
 
     def none(image: np.ndarray) -> np.ndarray:
         return image[..., :3]
@@ -85,7 +85,7 @@ def test_a_run_stops_at_the_error_of_its_denoised_image(tmp_path: Path) -> None:
 
 
 def test_a_denoiser_that_is_worse_than_the_noise_gives_way() -> None:
-    from full_geometry.scenes.cross_denoising import cross_denoised
+    from full_geometry.scenes.reference import cross_denoised
 
     truth = np.indices((64, 64)).sum(axis=0)[..., None] % 2 + np.array([0.5, 0.4, 0.3])
     found = _passes(truth, [4] * 16, 0.2, 0)

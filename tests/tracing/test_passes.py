@@ -7,8 +7,7 @@ import pytest
 
 from halfspace_sss import Medium
 from halfspace_sss.tracing import walk
-from halfspace_sss.tracing.passes import MAX_LANES, PATHS_PER_LANE, Estimate, estimate, launch_shape
-from halfspace_sss.tracing.tallies import BATCHES
+from halfspace_sss.tracing.passes import BATCHES, MAX_LANES, PATHS_PER_LANE, Estimate, estimate, launch_shape
 from halfspace_sss.tracing.tracer import trace
 
 

@@ -12,7 +12,7 @@ from halfspace_sss import Layers, Medium, trace
 from halfspace_sss.backend import array_types
 from halfspace_sss.maps.noisy_maps import CellGrid, draw_directions, trace_groups
 from halfspace_sss.physics.fresnel import F_t, mu_internal
-from halfspace_sss.tracing.tallies import FluxTally
+from halfspace_sss.tracing.passes import FluxTally
 from halfspace_sss.tracing.walk import WalkConstants, generator, pass_seed, walk
 
 MIXTURES = {

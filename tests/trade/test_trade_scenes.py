@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from figures import app as cli
 from full_geometry.integrators import translucent_walk
-from full_geometry.trade import assess, automatic, flat, measuring, recommend, recommend_flat
+from full_geometry.trade import advice, assess, automatic, measuring, recommend, recommend_flat
 from full_geometry.trade.assessing import assess_stage
 from full_geometry.trade.images import small_images
 from full_geometry.trade.results import Assessment, ObjectTrade, TechniqueTrade, samples_for
@@ -441,7 +441,9 @@ def test_a_medium_without_a_scene_gets_a_model_of_the_half_space() -> None:
 
 
 def test_the_command_writes_what_it_says_of_a_material(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(flat.recommend_flat, "__kwdefaults__", {**flat.recommend_flat.__kwdefaults__, "events": 2e5})
+    monkeypatch.setattr(
+        advice.recommend_flat, "__kwdefaults__", {**advice.recommend_flat.__kwdefaults__, "events": 2e5}
+    )
     arguments = ["--model", "better_dipole", "--tolerance", "0.6", "--out", str(tmp_path / "out")]
     result = CliRunner().invoke(cli.app, ["trade", "fig10", *arguments])
     assert result.exit_code == 0, result.stderr

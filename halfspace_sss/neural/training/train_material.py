@@ -18,17 +18,13 @@ from halfspace_sss.comparison.model_errors import ModelError, ReferenceSize, mod
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.maps.noisy_maps import CellGrid, Groups, draw_directions, make_pool
 from halfspace_sss.neural import material_model, paper_model
-from halfspace_sss.neural.hypernetwork import in_range
 from halfspace_sss.neural.material_model import network_arrays
-from halfspace_sss.neural.network import Network
+from halfspace_sss.neural.network import Network, SymmetricModel, channels
 from halfspace_sss.neural.paper_model import NeuralPaper
 from halfspace_sss.neural.store import check_weights_folder, save_weights, weights_folder, weights_name
-from halfspace_sss.neural.symmetric import SymmetricModel, channels
-from halfspace_sss.neural.training.fit import Fit, fit
-from halfspace_sss.neural.training.learners import PaperLearner, Small
-from halfspace_sss.neural.training.pool import MapPool
-from halfspace_sss.neural.training.unfinished import CHECKPOINT, claim
-from halfspace_sss.neural.universal import load_hypernetwork, shipped_weights
+from halfspace_sss.neural.training.fit import CHECKPOINT, Fit, claim, fit
+from halfspace_sss.neural.training.learners import MapPool, PaperLearner, Small
+from halfspace_sss.neural.universal import in_range, load_hypernetwork, shipped_weights
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import JsonDict, check_folder, path_of, provenance

@@ -25,23 +25,12 @@ from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.comparison.model_truths import exits
 from halfspace_sss.maps.grid import draw_media
 from halfspace_sss.maps.noisy_maps import CellGrid, draw_directions, load_maps, looking_back, make_pool
-from halfspace_sss.neural.features import N_MEDIUM, medium_features
-from halfspace_sss.neural.hypernetwork import (
-    CALIBRATION,
-    N_TERMS,
-    RANGES,
-    Hypernetwork,
-    Layers,
-    calibration_terms,
-    named_layers,
-)
+from halfspace_sss.neural.network import N_MEDIUM, N_TERMS, calibration_terms, medium_features
 from halfspace_sss.neural.store import save_weights
-from halfspace_sss.neural.training.fit import Fit, fit
-from halfspace_sss.neural.training.learners import Hyper
-from halfspace_sss.neural.training.pool import MapPool, torch_library
+from halfspace_sss.neural.training.fit import CHECKPOINT, Fit, claim, fit
+from halfspace_sss.neural.training.learners import Hyper, MapPool, torch_library
 from halfspace_sss.neural.training.train_material import Trial
-from halfspace_sss.neural.training.unfinished import CHECKPOINT, claim
-from halfspace_sss.neural.universal import hypernetwork_of
+from halfspace_sss.neural.universal import CALIBRATION, RANGES, Hypernetwork, Layers, hypernetwork_of, named_layers
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.backbone import length_scale
 from halfspace_sss.physics.fresnel import mu_internal
