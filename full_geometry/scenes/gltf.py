@@ -56,7 +56,8 @@ def gltf_scene(path: Path) -> dict[str, Any]:
     A map of the same stem beside it, .hdr or .exr, becomes the environment, as Blender turns it. Custom properties
     (`extras`) of a material whose names begin with sss_ make it `translucent`: the rest of a name is a parameter of
     that surface, lengths in mm; the base colour stands for `reflectance` where `mfp` is given alone. sss_radius and
-    sss_scale are those of Blender's Principled BSDF in metres, sss_alpha is a rough boundary. Lights are in W/sr
+    sss_scale are those of Blender's Principled BSDF in metres, sss_alpha is a rough boundary, and sss_weight blends it
+    with the surface that the material has without, as the subsurface weight of OpenPBR does. Lights are in W/sr
     and W/m², as Blender's lighting mode "Standard" has them. One warning names all that is not taken.
 
     Raises:
@@ -243,23 +244,34 @@ class _File:
         if not given and medium is None and clear and solid and get.get("attenuationDistance", math.inf) < math.inf:
             depth = -np.log(get.get("attenuationColor", (1.0, 1.0, 1.0)))
             medium = Medium((0.0,) * 3, depth / (MM_PER_METRE * get["attenuationDistance"]), 0.0, eta)
-        opaque = not (given or medium or clear or (leaf and not solid))
-        if given or medium:
-            result = _translucent(given, medium, base, eta)
-            told += ["roughness"] if roughness and "bsdf" not in result else []
-            told += ["metallic"] if metallic else []
+        weight = given.pop("weight", 1.0)
+        if not (isinstance(weight, float | int) and 0 < weight <= 1):
+            raise ValueError(f"sss_weight must be a number in (0, 1], got {weight!r}")
+        opaque, scatters = not (given or medium or clear or (leaf and not solid)), bool(given or medium)
+        shown = {"eta": eta, "base_color": base, "roughness": self._gray(rough, 1, roughness)}
+        if solid or opaque or scatters:
+            shown |= {"type": "principled", "metallic": self._gray(rough, 2, metallic)}
         else:
-            result = {"eta": eta, "spec_trans": clear, "base_color": base, "roughness": self._gray(rough, 1, roughness)}
-            if solid or opaque:
-                result |= {"type": "principled", "metallic": self._gray(rough, 2, metallic)}
-            else:
-                result |= {"type": "principledthin", "diff_trans": 2 * leaf}
+            shown |= {"type": "principledthin", "diff_trans": 2 * leaf}
+        results = [shown if scatters else shown | {"spec_trans": clear}]
+        if scatters:
+            inside = _translucent(given, medium, base, eta)
+            left = {
+                "roughness": roughness and ("bsdf" not in inside or rough is not None), "metallic": metallic,
+                "transmissionFactor": given and clear, "diffuseTransmissionFactor": given and leaf,
+                "base color": base.get("value") != [1.0] * 3 and not given.keys() & {"radius", "mfp"} and weight == 1,
+            }  # fmt: skip
+            told += [key for key, there in left.items() if there]
+            results = [shown, inside] if weight < 1 else [inside]
         self.not_taken += [f"{key} ({material.name})" for key in told]
         bump = material.normalTexture
         if bump is not None:
             pixels = 0.5 + (self._pixels(bump.index, raw=True)[..., :3] - 0.5) * [*(bump.scale or 1.0,) * 2, 1.0]
-            result = {"type": "normalmap", "normalmap": self._bitmap(bump, pixels, raw=True), "bsdf": result}
-        return {"type": "twosided", "bsdf": result} if opaque else result
+            bump = self._bitmap(bump, pixels, raw=True)
+            results = [{"type": "normalmap", "normalmap": bump, "bsdf": each} for each in results]
+        if len(results) == 2:
+            return {"type": "blendbsdf", "weight": weight, "bsdf_0": results[0], "bsdf_1": results[1]}
+        return {"type": "twosided", "bsdf": results[0]} if opaque else results[0]
 
     def _masked(self, material: pygltflib.Material, surface: dict[str, Any]) -> dict[str, Any]:
         """The surface behind the alpha of its base colour."""
@@ -326,7 +338,7 @@ def _translucent(given: dict[str, Any], medium: Medium | None, base: dict[str, A
             medium = Medium.from_principled(base["value"], radius, scale, g, eta)
         else:  # the light that enters and leaves again, as in `Medium.from_openpbr`, taken for that under even light
             enters = half_space_reflectance(1.0, 0.0, eta, 1.0)
-            base["bitmap"] = mi.Bitmap(np.array(base["bitmap"]) * np.float32(enters))
+            base = base | {"bitmap": mi.Bitmap(np.array(base["bitmap"]) * np.float32(enters))}
             given |= {"reflectance": base, "mfp": MM_PER_METRE * scale * (1 - g) / (4 * np.pi) * radius}
     elif "mfp" in given:
         given.setdefault("reflectance", _text(base["value"]) if base["type"] == "rgb" else base)

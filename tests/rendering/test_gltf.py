@@ -11,13 +11,14 @@ import pytest
 
 from full_geometry.scenes.gltf import gltf_scene
 from full_geometry.scenes.scene_files import load_scene, names_nothing, open_scene
-from full_geometry.surface.wrapped import surface_of
+from full_geometry.surface.wrapped import surface_of, wrapping_of
 from halfspace_sss import Medium
 from halfspace_sss.materials import load
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
 mi = pytest.importorskip("mitsuba")
+dr = pytest.importorskip("drjit")
 gltf = pytest.importorskip("pygltflib")
 
 SKIN = {"sss_mfp": [1.2, 0.5, 0.3], "sss_model": "better_dipole"}
@@ -154,6 +155,19 @@ def test_textures_keep_their_place_and_are_multiplied(tmp_path: Path) -> None:
     si.uv = mi.Point2f([0.25, 0.75, 0.25, 0.75], [0.25, 0.25, 0.75, 0.75])  # v goes down in glTF
     colors = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]]) * [0.8, 0.5, 0.3]
     np.testing.assert_allclose(np.array(texture.eval(si)).T, colors, atol=1e-6)
+
+
+def test_a_weight_blends_the_medium_with_the_surface(tmp_path: Path) -> None:
+    bumps = {"normalTexture": gltf.NormalMaterialTexture(index=0)}
+    with pytest.warns(UserWarning, match=r"not taken from it: roughness \(skin\)$"):
+        blend = gltf_scene(_glb(tmp_path, {**SKIN, "sss_weight": 0.25}, look=bumps))["material skin"]
+    assert [blend[key]["type"] for key in ("bsdf_0", "bsdf_1")] == 2 * ["normalmap"]
+    assert [blend[key]["bsdf"]["type"] for key in ("bsdf_0", "bsdf_1")] == ["principled", "translucent"]
+    ball = {"type": "sphere", "bsdf": blend}
+    around = wrapping_of(mi.load_dict({"type": "scene", "ball": ball}).shapes()[0])
+    assert float(around.mixes[0].share(dr.zeros(mi.SurfaceInteraction3f), mi.Bool(True))[0]) == 0.25
+    with pytest.raises(ValueError, match=r"sss_weight must be a number in \(0, 1\], got 2"):
+        gltf_scene(_glb(tmp_path, {**SKIN, "sss_weight": 2}))
 
 
 def test_what_is_not_taken_is_listed_once(tmp_path: Path) -> None:
