@@ -9,6 +9,7 @@ import math
 import os
 import platform
 import statistics
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -26,6 +27,7 @@ from halfspace_sss.physics.medium import Medium
 from halfspace_sss.physics.reflectance import _inverse
 from halfspace_sss.registry import bssrdf, models
 from halfspace_sss.tracing.passes import AngularTally, FluxTally
+from halfspace_sss.tracing.tracer import trace
 from halfspace_sss.tracing.walk import Tally, pass_seed, walk
 
 MEDIA = ((0.75, 0.0, 1.3), (0.99, 0.0, 1.5), (0.999, 0.9, 1.3))
@@ -72,6 +74,23 @@ def bench_walk(lanes: int = 32768, per_lane: int = 64, media: Media = MEDIA) -> 
             if not peel_off:
                 row |= {"sd_per_path": math.sqrt(variance), "efficiency": paths / (variance * seconds)}
             yield row
+
+
+def bench_traces(backend: str, n_paths: int, media: Media = MEDIA) -> Iterator[Row]:
+    """Events per second of `trace`, with all that it does besides its kernels, which are known.
+
+    Args:
+        backend: "llvm" or "cuda".
+        n_paths: of each medium, at normal incidence.
+        media: albedo, g and eta of each.
+    """
+    for albedo, g, eta in media:
+        medium = _medium(albedo, g, eta)
+        trace(medium, n_paths=n_paths, backend=backend)
+        runs = [trace(medium, n_paths=n_paths, seed=seed, backend=backend) for seed in range(1, REPEATS + 1)]
+        seconds = statistics.median(run.seconds for run in runs)
+        row: Row = {"albedo": albedo, "g": g, "eta": eta, "paths": float(runs[0].n_paths), "seconds": seconds}
+        yield row | {"events_per_s": runs[0].n_events / seconds}
 
 
 def _half_space(mi: ModuleType, albedo: float, g: float, eta: float, rr_depth: int, size: int) -> object:
@@ -212,14 +231,18 @@ def peak_memory() -> float | None:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**30 if sys.platform == "darwin" else 2**20)
 
 
-def machine() -> dict[str, int | str | None]:
-    """What the figures depend on: processor, number of its threads, system."""
+def machine(backend: str = "llvm") -> dict[str, int | str | None]:
+    """What the figures depend on: processor, number of its threads, system, and the GPU where one is measured."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         processor = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
     except (OSError, StopIteration):
         processor = platform.processor() or platform.machine()
-    return {"processor": processor, "threads": os.cpu_count(), "system": f"{platform.system()} {platform.machine()}"}
+    about = {"processor": processor, "threads": os.cpu_count(), "system": f"{platform.system()} {platform.machine()}"}
+    if backend == "cuda":
+        call = ["nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader"]
+        about["gpu"] = subprocess.run(call, capture_output=True, text=True, check=True).stdout.strip()
+    return about
 
 
 def kernel_seconds(make: Callable[[], object]) -> float:

@@ -1,4 +1,4 @@
-"""The study `bench`: what the walk, Mitsuba's volpath, the models and maps cost here."""
+"""The study `bench`: what walks, Mitsuba's volume path tracer, models, maps and renders cost here, by CPU or GPU."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from enum import Enum
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -21,15 +21,27 @@ class BenchPart(str, Enum):
     volpath = "volpath"
     models = "models"
     maps = "maps"
+    trace = "trace"
+    renders = "renders"
+    edits = "edits"
+    first = "first"
 
 
 PARTS = tuple(part.value for part in BenchPart)
-SECONDS = {"walk": 1, "volpath": 15, "models": 3, "maps": 100}  # about, for a row; only the time left depends on it
+OF_BACKEND = {"llvm": PARTS[:4], "cuda": PARTS[4:]}  # measured where no part is asked for
+# about, for a row; only the time left depends on it
+SECONDS = {"walk": 1, "volpath": 15, "models": 3, "maps": 100, "trace": 2, "renders": 12, "edits": 10, "first": 30}
+SIZES = {"llvm": 256, "cuda": 1024}  # pixels of square images; those of `renders` are half as wide
+PATHS = {"llvm": 2**24, "cuda": 2**33}  # of a trace
 TITLES = {
     "walk": "walk at normal incidence, flux alone or with peel-off towards one direction",
     "volpath": "Mitsuba's volpath for the same reflectance: time for equal error over the time of the walk",
     "models": "evaluations of S per second, float32; NumPy runs on one thread, torch and Dr.Jit on all",
     "maps": "training maps to a mean cell error",
+    "trace": "`trace` at normal incidence, all that it does counted",
+    "renders": "variance x time of volpathmis over that of a way, summed over the pixels of the object",
+    "edits": "seconds of the first image of a scene, and after an edit, 1 sample a pixel",
+    "first": "seconds of a new process to its first image, with no kernel known and with all",
 }
 COLUMNS = {  # key of a row -> heading and format
     "albedo": ("albedo", "{:g}"), "g": ("g", "{:g}"), "eta": ("eta", "{:g}"),
@@ -40,39 +52,61 @@ COLUMNS = {  # key of a row -> heading and format
     "model": ("model", "{}"), "orders": ("orders", "{}"),
     "weight_variance": ("variance of\nsample weight", "{:.2f}"),
     "numpy": ("NumPy", "{:.1e}"), "torch": ("torch", "{:.1e}"), "drjit": ("Dr.Jit", "{:.1e}"), "maps": ("maps", "{}"),
+    "object": ("object", "{}"), "light": ("light", "{}"), "way": ("way", "{}"), "pixels": ("pixels", "{}"),
+    "ns": ("ns a sample", "{:.1f}"), "fill_s": ("light inside,\nseconds", "{:.2f}"),
+    "over_volpathmis": ("volpathmis\nover it", "{:.2f}"), "ready_s": ("ready", "{:.2f}"),
+    "light_s": ("light turned", "{:.3f}"), "camera_s": ("camera moved", "{:.3f}"),
+    "empty_s": ("no kernels", "{:.1f}"), "known_s": ("kernels known", "{:.1f}"),
     "mean_cell_error": ("mean cell\nerror", "{:.3f}"), "seconds": ("seconds", "{:.3g}"), "paths": ("paths", "{:.2e}"),
 }  # fmt: skip
 
 
-def chosen_parts(asked: Sequence[str] | None) -> list[str]:
-    """The parts to measure, in the order of `PARTS`; volpath is compared with the walk and brings it along."""
-    asked = asked or PARTS
+def chosen_parts(asked: Sequence[str] | None, backend: str = "llvm") -> list[str]:
+    """The parts to measure, in the order of `PARTS`; volpath is compared with the walk and brings it along.
+
+    Raises:
+        ValueError: a part is of the CPU alone, and the backend is not.
+    """
+    asked = asked or OF_BACKEND[backend]
+    of_cpu = [part for part in asked if part in OF_BACKEND["llvm"]]
+    if backend == "cuda" and of_cpu:
+        raise ValueError(f"only must be one of {', '.join(OF_BACKEND[backend])} with --backend cuda, got {of_cpu[0]!r}")
     return [part for part in PARTS if part in asked or (part == "walk" and "volpath" in asked)]
 
 
 def bench(
     only: Annotated[list[BenchPart] | None, typer.Option(help="A part; repeat for more.", show_default="all")] = None,
+    backend: Annotated[Literal["llvm", "cuda"], typer.Option(help="CPU or GPU.")] = "llvm",
     quick: Annotated[bool, typer.Option("--quick", help="Small runs that only show that everything works.")] = False,
     out: shared.OutFolder = Path("bench"),
 ) -> None:
-    """Measure speed: events and paths per second, equal-error time of volpath, evaluations of models, maps."""
+    """Measure speed: events a second, equal-error time over Mitsuba, models, maps, renders, edits, first images.
+
+    By default the CPU is measured by walk, volpath, models and maps, a GPU by the other parts.
+    """
     from benchmarks.bench import machine, peak_memory
+    from halfspace_sss.backend import array_types
     from halfspace_sss.provenance import check_folder, provenance, write_together
 
-    parts, notes = chosen_parts(only), []
+    parts, notes = chosen_parts(only, backend), []
     check_folder(out)
     if "volpath" in parts and find_spec("mitsuba") is None:
         parts.remove("volpath")
         notes.append("volpath is left out: Mitsuba is not installed (`pip install halfspace-sss[render]`)")
     if "models" in parts and find_spec("torch") is None:
         notes.append("the models are not measured in torch, which is not installed")
-    measured = _measured(parts, quick)
+    array_types(backend)
+    measured = _measured(parts, backend, quick)
 
     import pandas
 
     memory = peak_memory()
     files = {out / f"bench_{part}.csv": shared.csv_of(pandas.DataFrame(rows)) for part, rows in measured.items()}
-    about = {"provenance": provenance(quick=quick, parts=parts), "machine": machine(), "notes": notes}
+    about = {
+        "provenance": provenance(quick=quick, parts=parts, backend=backend),
+        "machine": machine(backend),
+        "notes": notes,
+    }
     about |= {"peak_memory_gib": memory, **measured}
     files[out / "bench.json"] = json.dumps(about, indent=1, allow_nan=False) + "\n"
     write_together(files)
@@ -84,7 +118,7 @@ def bench(
     shared.say_files(files)
 
 
-def _measured(parts: list[str], quick: bool) -> dict[str, list[dict]]:
+def _measured(parts: list[str], backend: str, quick: bool) -> dict[str, list[dict]]:
     """Rows by part."""
     tables: dict[str, list[dict]] = {part: [] for part in parts}
     lengths = _lengths(quick)
@@ -92,7 +126,7 @@ def _measured(parts: list[str], quick: bool) -> dict[str, list[dict]]:
     with shared.Bar("measuring") as bar:
         for part in parts:
             bar.show(done, total, part)
-            for row in _rows(part, quick, tables):
+            for row in _rows(part, backend, quick, tables):
                 tables[part].append(row)
                 bar.show(done + SECONDS[part] * len(tables[part]), total, part)
             done += SECONDS[part] * lengths[part]  # a model may have refused the medium
@@ -106,10 +140,11 @@ def _lengths(quick: bool) -> dict[str, int]:
     from halfspace_sss import models
 
     media, depths, maps = (1 if quick else len(each) for each in (MEDIA, ROULETTE_DEPTHS, MAP_MEDIA))
-    return {"walk": 2 * media, "volpath": media * depths, "models": len(models()), "maps": maps}
+    renders = {"trace": media, "renders": 12, "edits": 2, "first": 4}
+    return {"walk": 2 * media, "volpath": media * depths, "models": len(models()), "maps": maps, **renders}
 
 
-def _rows(part: str, quick: bool, tables: dict[str, list[dict]]) -> Iterator[dict]:
+def _rows(part: str, backend: str, quick: bool, tables: dict[str, list[dict]]) -> Iterator[dict]:
     from benchmarks import bench
     from halfspace_sss.maps.grid import MapGrid
 
@@ -119,6 +154,18 @@ def _rows(part: str, quick: bool, tables: dict[str, list[dict]]) -> Iterator[dic
         return bench.bench_volpath(tables["walk"], *((16, 4, (64,)) if quick else ()))
     if part == "models":
         return bench.bench_models(n=1024, least_seconds=0.01) if quick else bench.bench_models()
+    if part == "trace":
+        return bench.bench_traces(backend, 2**14 if quick else PATHS[backend], bench.MEDIA[: 1 if quick else None])
+    if part != "maps":
+        from benchmarks import bench_renders
+
+        variant, size = f"{backend}_ad_rgb", 32 if quick else SIZES[backend]
+        if part == "edits":
+            return bench_renders.bench_edits(variant, size)
+        if part == "first":
+            return bench_renders.bench_first_images(variant, size, 0.0 if quick else bench_renders.TRAINING)
+        few = {"spp": 2, "training": 0.0} if quick else {}
+        return bench_renders.bench_walks(variant, size // 2, **few)
     return bench.bench_maps(1.0, MapGrid(2, 16, 8, 8), bench.MAP_MEDIA[:1]) if quick else bench.bench_maps()
 
 

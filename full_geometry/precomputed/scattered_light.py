@@ -103,7 +103,8 @@ class ScatteredLight:
         # ---- of these a few, each with the probability of its flux, in order along the faces
         ends = dr.cumsum(dr.float64_array_t(mi.Float)(size))
         total = float(ends[-1])
-        at = (dr.arange(type(ends), number) + float(u[0])) * (total / number)
+        first, step = (dr.opaque(type(ends), v) for v in (float(u[0]), total / number))
+        at = (dr.arange(type(ends), number) + first) * step
         which = dr.binary_search(0, many - 1, lambda i: dr.gather(type(ends), ends, i) < at)
         o, d, off, enters, flux, size = (dr.gather(type(v), v, which) for v in (o, d, off, enters, flux, size))
         flux = dr.select(size > 0, flux * (opaque(total / (number * parts)) / dr.maximum(size, 1e-30)), 0)

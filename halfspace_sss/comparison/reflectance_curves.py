@@ -144,7 +144,7 @@ def curves(
     _check_orders(orders, line, angles, medium.eta)
     chosen, notes = _chosen_models(models, medium)
     n_paths = default_paths(medium, backend) if n_paths is None else n_paths
-    passes = launch_shape(n_paths)[2] if n_paths else 0
+    passes = launch_shape(n_paths, backend == "cuda")[2] if n_paths else 0
     steps = _Steps(progress, len(angles) * (passes + len(chosen)) + len(chosen))
     results, walks, seconds = [], 0, 0.0
     for k, theta in enumerate(angles):

@@ -198,7 +198,9 @@ def find_cell(edges: Lanes, value: Lanes) -> tuple[Lanes, Lanes]:
 
 
 ORDERS = ("single", "multiple", "total")
-PATHS_PER_LANE, MAX_LANES = 64, 131072
+PATHS_PER_LANE, FEWEST_LANES, MAX_LANES = 64, 16384, 131072
+# a GPU has events of 30 ps, so that what Python does for a pass wants passes of 2e9 walks
+CUDA_PATHS_PER_LANE, CUDA_LANES = 8192, 2**18
 
 
 class Estimate(NamedTuple):
@@ -269,10 +271,13 @@ def checked_radii(radii: Sequence[float] | None, mu_i: float | str) -> np.ndarra
     return edges
 
 
-def launch_shape(n_paths: int) -> tuple[int, int, int]:
+def launch_shape(n_paths: int, cuda: bool = False) -> tuple[int, int, int]:
     """Lanes (whole batches), walks per lane and passes that together trace at least `n_paths` walks."""
-    per_lane = int(np.clip(n_paths // 16384, 1, PATHS_PER_LANE))
-    lanes = min(BATCHES * math.ceil(n_paths / (per_lane * BATCHES)), MAX_LANES)
+    fewest, per_lane, most = (
+        (CUDA_LANES, CUDA_PATHS_PER_LANE, CUDA_LANES) if cuda else (16384, PATHS_PER_LANE, MAX_LANES)
+    )
+    per_lane = int(np.clip(n_paths // fewest, 1, per_lane))
+    lanes = min(BATCHES * math.ceil(n_paths / (per_lane * BATCHES)), most)
     return lanes, per_lane, math.ceil(n_paths / (lanes * per_lane))
 
 
@@ -335,7 +340,9 @@ def walk_passes(
         progress: called with (passes done, passes in all).
         trace: the walk in the medium, with the arguments of `walk`.
     """
-    lanes, per_lane, passes = launch_shape(n_paths)
+    import drjit as dr
+
+    lanes, per_lane, passes = launch_shape(n_paths, dr.backend_v(types.Float) == dr.JitBackend.CUDA)
     for done in range(1, passes + 1):
         mu, recorded = _incidence(mu_i, lanes, np.random.default_rng([*seed, done])), tallies()
         mu_in = types.Float(mu_internal(mu, medium.eta))
