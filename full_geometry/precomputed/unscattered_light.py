@@ -151,12 +151,15 @@ def unscattered_light(
         brick, slot = grid.index.brick, grid.index.slot
         bricks.append(dr.select(brick >= 0, brick + dr.opaque(mi.Int32, 2 * cells_before), -1))
         slots.append(dr.select(slot >= 0, slot + dr.opaque(mi.Int32, slots_before), -1))
-        for key, value in (("first", bricks_before), ("low", grid.low), ("scale", 1 / grid.h), ("counts", grid.counts)):
+        about = {"first": bricks_before, "low": grid.low, "scale": float(1 / grid.h), "counts": grid.counts}
+        for key, value in about.items():
             rows[key].append(value)
         bricks_before, cells_before = bricks_before + dr.width(brick), cells_before + dr.width(slot)
         slots_before += grid.slots
-    kinds = {"first": mi.Int32, "low": mi.Point3f, "scale": mi.Float, "counts": mi.Vector3i}
-    tables = {key: kind(np.array(rows[key]).T) for key, kind in kinds.items()}
+    # lists are copied; the memory of NumPy would be taken over, and its chance alignment is in the code of kernels
+    tables = {key: kind(rows[key]) for key, kind in (("first", mi.Int32), ("scale", mi.Float))}
+    tables["low"] = mi.Point3f(*(mi.Float([float(v) for v in axis]) for axis in np.transpose(rows["low"])))
+    tables["counts"] = mi.Vector3i(*(mi.Int32([int(v) for v in axis]) for axis in np.transpose(rows["counts"])))
     index = CellIndex(_joined(bricks), _joined(slots))
     light = _joined(fluence), _joined(directions) if directional else None
     dr.make_opaque(tables, index, light)
