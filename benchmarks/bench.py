@@ -76,17 +76,18 @@ def bench_walk(lanes: int = 32768, per_lane: int = 64, media: Media = MEDIA) -> 
             yield row
 
 
-def bench_traces(backend: str, n_paths: int, media: Media = MEDIA) -> Iterator[Row]:
+def bench_traces(backend: str, n_events: int, media: Media = MEDIA) -> Iterator[Row]:
     """Events per second of `trace`, with all that it does besides its kernels, which are known.
 
     Args:
         backend: "llvm" or "cuda".
-        n_paths: of each medium, at normal incidence.
+        n_events: of each medium, about, at normal incidence.
         media: albedo, g and eta of each.
     """
     for albedo, g, eta in media:
         medium = _medium(albedo, g, eta)
-        trace(medium, n_paths=n_paths, backend=backend)
+        pilot = trace(medium, n_paths=2**14, backend=backend)
+        n_paths = n_events // (pilot.n_events // pilot.n_paths + 1)
         runs = [trace(medium, n_paths=n_paths, seed=seed, backend=backend) for seed in range(1, REPEATS + 1)]
         seconds = statistics.median(run.seconds for run in runs)
         row: Row = {"albedo": albedo, "g": g, "eta": eta, "paths": float(runs[0].n_paths), "seconds": seconds}

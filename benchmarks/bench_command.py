@@ -23,16 +23,28 @@ class BenchPart(str, Enum):
     maps = "maps"
     trace = "trace"
     renders = "renders"
+    learnt = "learnt"
     edits = "edits"
     first = "first"
 
 
 PARTS = tuple(part.value for part in BenchPart)
-OF_BACKEND = {"llvm": PARTS[:4], "cuda": PARTS[4:]}  # measured where no part is asked for
+# measured where no part is asked for; a learnt object, which takes minutes, is asked for
+OF_BACKEND = {"llvm": PARTS[:4], "cuda": tuple(part for part in PARTS[4:] if part != "learnt")}
 # about, for a row; only the time left depends on it
-SECONDS = {"walk": 1, "volpath": 15, "models": 3, "maps": 100, "trace": 2, "renders": 12, "edits": 10, "first": 30}
+SECONDS = {
+    "walk": 1,
+    "volpath": 15,
+    "models": 3,
+    "maps": 100,
+    "trace": 2,
+    "renders": 12,
+    "learnt": 60,
+    "edits": 10,
+    "first": 30,
+}
 SIZES = {"llvm": 256, "cuda": 1024}  # pixels of square images; those of `renders` are half as wide
-PATHS = {"llvm": 2**24, "cuda": 2**33}  # of a trace
+EVENTS = {"llvm": 2**27, "cuda": 2**34}  # of a trace
 TITLES = {
     "walk": "walk at normal incidence, flux alone or with peel-off towards one direction",
     "volpath": "Mitsuba's volpath for the same reflectance: time for equal error over the time of the walk",
@@ -40,6 +52,7 @@ TITLES = {
     "maps": "training maps to a mean cell error",
     "trace": "`trace` at normal incidence, all that it does counted",
     "renders": "variance x time of volpathmis over that of a way, summed over the pixels of the object",
+    "learnt": "the same of a learnt object, light sampled",
     "edits": "seconds of the first image of a scene, and after an edit, 1 sample a pixel",
     "first": "seconds of a new process to its first image, with no kernel known and with all",
 }
@@ -53,7 +66,7 @@ COLUMNS = {  # key of a row -> heading and format
     "weight_variance": ("variance of\nsample weight", "{:.2f}"),
     "numpy": ("NumPy", "{:.1e}"), "torch": ("torch", "{:.1e}"), "drjit": ("Dr.Jit", "{:.1e}"), "maps": ("maps", "{}"),
     "object": ("object", "{}"), "light": ("light", "{}"), "way": ("way", "{}"), "pixels": ("pixels", "{}"),
-    "ns": ("ns a sample", "{:.1f}"), "fill_s": ("light inside,\nseconds", "{:.2f}"),
+    "ns": ("ns a sample", "{:.1f}"), "cells_s": ("cells, s", "{:.2f}"),
     "over_volpathmis": ("volpathmis\nover it", "{:.2f}"), "ready_s": ("ready", "{:.2f}"),
     "light_s": ("light turned", "{:.3f}"), "camera_s": ("camera moved", "{:.3f}"),
     "empty_s": ("no kernels", "{:.1f}"), "known_s": ("kernels known", "{:.1f}"),
@@ -68,9 +81,9 @@ def chosen_parts(asked: Sequence[str] | None, backend: str = "llvm") -> list[str
         ValueError: a part is of the CPU alone, and the backend is not.
     """
     asked = asked or OF_BACKEND[backend]
-    of_cpu = [part for part in asked if part in OF_BACKEND["llvm"]]
+    of_cpu = [part for part in asked if part in PARTS[:4]]
     if backend == "cuda" and of_cpu:
-        raise ValueError(f"only must be one of {', '.join(OF_BACKEND[backend])} with --backend cuda, got {of_cpu[0]!r}")
+        raise ValueError(f"only must be one of {', '.join(PARTS[4:])} with --backend cuda, got {of_cpu[0]!r}")
     return [part for part in PARTS if part in asked or (part == "walk" and "volpath" in asked)]
 
 
@@ -140,7 +153,7 @@ def _lengths(quick: bool) -> dict[str, int]:
     from halfspace_sss import models
 
     media, depths, maps = (1 if quick else len(each) for each in (MEDIA, ROULETTE_DEPTHS, MAP_MEDIA))
-    renders = {"trace": media, "renders": 12, "edits": 2, "first": 4}
+    renders = {"trace": media, "renders": 9, "learnt": 9, "edits": 2, "first": 4}
     return {"walk": 2 * media, "volpath": media * depths, "models": len(models()), "maps": maps, **renders}
 
 
@@ -155,7 +168,7 @@ def _rows(part: str, backend: str, quick: bool, tables: dict[str, list[dict]]) -
     if part == "models":
         return bench.bench_models(n=1024, least_seconds=0.01) if quick else bench.bench_models()
     if part == "trace":
-        return bench.bench_traces(backend, 2**14 if quick else PATHS[backend], bench.MEDIA[: 1 if quick else None])
+        return bench.bench_traces(backend, 2**16 if quick else EVENTS[backend], bench.MEDIA[: 1 if quick else None])
     if part != "maps":
         from benchmarks import bench_renders
 
@@ -164,8 +177,9 @@ def _rows(part: str, backend: str, quick: bool, tables: dict[str, list[dict]]) -
             return bench_renders.bench_edits(variant, size)
         if part == "first":
             return bench_renders.bench_first_images(variant, size, 0.0 if quick else bench_renders.TRAINING)
-        few = {"spp": 2, "training": 0.0} if quick else {}
-        return bench_renders.bench_walks(variant, size // 2, **few)
+        few = {"spp": 2} if quick else {}
+        training = (2.0 if quick else bench_renders.TRAINING) if part == "learnt" else 0.0
+        return bench_renders.bench_renders(variant, size // 2, training, **few)
     return bench.bench_maps(1.0, MapGrid(2, 16, 8, 8), bench.MAP_MEDIA[:1]) if quick else bench.bench_maps()
 
 

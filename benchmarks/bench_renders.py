@@ -23,7 +23,7 @@ WALKED = (("hand of potato", "windows"), ("ribbon of cream", "lamp and sky"), ("
 EDITED = "bunny of marble", "windows"
 FIRST = ("better_dipole, gathered", "better_dipole, corrected", "walk", "full_geometry, gathered")
 WALKS, LEARNT = "walk", "full_geometry, sampled"
-SPP, LEARNT_SPP = 64, 16  # of an image; the first are also those that the precomputation of light inside is shared by
+SPP, LEARNT_SPP = 64, 16  # of an image
 PASSES, TRAINING = 6, 10.0  # images of a way; seconds of a training
 PATIENCE = 600.0  # seconds for a first image
 
@@ -42,18 +42,18 @@ def use_variant(variant: str) -> None:
     full_geometry.register()
 
 
-def bench_walks(variant: str, size: int, spp: int = SPP, training: float = TRAINING) -> Iterator[Row]:
-    """Walks and a learnt object over Mitsuba's `volpathmis` at its better roulette depth, of 64 and 200.
+def bench_renders(variant: str, size: int, training: float = 0.0, spp: int = SPP) -> Iterator[Row]:
+    """Walks, or a learnt object, over Mitsuba's `volpathmis` at its better roulette depth, of 64 and 200.
 
     The cost of a way is the variance of a sample, summed over all pixels of the object, edges included, times its
-    seconds; those of the precomputed light are shared by 64 samples of a pixel. A row has nanoseconds a sample, seconds
-    of that precomputation, and how many times less the cost is than that of `volpathmis`.
+    seconds. Each image precomputes its light inside; cells, which a scene makes once, are shared by 64 samples of a
+    pixel. A row has nanoseconds a sample, seconds of cells, and the cost of `volpathmis` over that of the way.
 
     Args:
         variant: of Mitsuba.
         size: pixels of the square images.
+        training: seconds that `full_geometry` learns each object, of which light is then sampled; 0 takes walks.
         spp: samples of a pixel in each of `PASSES` images, of a learnt object 16 at most.
-        training: seconds that `full_geometry` learns each object; 0 leaves it out.
     """
     use_variant(variant)
     from benchmarks.speeds import VOLUMES, LitObject, scene_of, train
@@ -65,7 +65,7 @@ def bench_walks(variant: str, size: int, spp: int = SPP, training: float = TRAIN
     for case in (LitObject(*pair) for pair in WALKED):
         with TemporaryDirectory() as temporary:
             folder, costs, rows = Path(temporary), {}, []
-            ways = (*VOLUMES, WALKS, *((LEARNT,) if training else ()))
+            ways = (*VOLUMES, LEARNT if training else WALKS)
             if training:
                 train(case, training, folder)
 
@@ -85,13 +85,13 @@ def bench_walks(variant: str, size: int, spp: int = SPP, training: float = TRAIN
                         took.append(clock() - started)
                     inside = cover(scene if not isinstance(scene, tuple) else scene[0]) > 0
                     seconds = float(np.median(took[1:]))
-                    fill = max(took[0] - seconds, 0.0) if way == WALKS else 0.0
+                    cells = max(took[0] - seconds, 0.0) if way == WALKS else 0.0
                     variance = np.asarray(images[1:], dtype=np.float64)[:, inside].var(axis=0, ddof=1).sum() * n
-                    costs[way] = variance * (seconds / n + fill / SPP)
+                    costs[way] = variance * (seconds / n + cells / SPP)
                     rows.append(
                         {
                             "object": case.name, "light": case.light, "way": way,
-                            "ns": 1e9 * seconds / (n * size**2), "fill_s": fill,
+                            "ns": 1e9 * seconds / (n * size**2), "cells_s": cells,
                             "mean": float(np.mean([image[inside].mean() for image in images])),
                         }
                     )  # fmt: skip

@@ -22,9 +22,9 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from full_geometry.geometry.points import (
-    AreaPoints,
     EntrySample,
     SurfacePoint,
+    area_points,
     cosine_above,
     lifted,
     opaque,
@@ -50,7 +50,7 @@ def lattice(count: int, roots: Sequence[float] = R_3, shift: Sequence[float] = (
 
 def uniform_entries(geometry: Geometry, u_face: mi.Float, u: mi.Point2f) -> EntrySample:
     """Points uniform over the area of an object."""
-    at = AreaPoints(geometry.shape).sample(u_face, u, mi.Bool(True))
+    at = area_points(geometry).sample(u_face, u, mi.Bool(True))
     face = mi.UInt32(at.prim_index) + dr.zeros(mi.UInt32, dr.width(u))
     n, n_out = at.outward(geometry.side(face))
     return EntrySample(mi.Point3f(at.p), n, mi.Normal3f(n_out), opaque(geometry.area), face)

@@ -20,6 +20,7 @@ import math
 from copy import copy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from weakref import WeakKeyDictionary
 
 import drjit as dr
 import mitsuba as mi
@@ -692,6 +693,16 @@ class AreaPoints:
             n_shading = dr.normalize(sum(w * v for w, v in zip(weights, normals)))
         p = sum(w * c for w, c in zip(weights, corners))
         return Point(mi.Point3f(p), mi.Normal3f(n), mi.Normal3f(n_shading), face)
+
+
+_AREA_POINTS: WeakKeyDictionary[Geometry, AreaPoints] = WeakKeyDictionary()
+
+
+def area_points(geometry: Geometry) -> AreaPoints:
+    """Uniform points of an object: made once, as areas of faces wait for all kernels and are summed by NumPy."""
+    if geometry not in _AREA_POINTS:
+        _AREA_POINTS[geometry] = AreaPoints(geometry.shape)
+    return _AREA_POINTS[geometry]
 
 
 # --------------------------------------------------------------------------------------------------

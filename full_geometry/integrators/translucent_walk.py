@@ -89,6 +89,7 @@ def _class(variant: str) -> type:
             check_choice("light", self.light, WALK_LIGHTS)
             self.layers = bool(props.get("layers", False))
             self._prepared: tuple[SceneMark | None, list, list, Any] = (None, [], [], None)
+            self._checked: tuple[Any, str] = (None, "")
             self._cells: tuple[Any, list] = (None, [])
             self._kept: tuple[Snapshot | None, UnscatteredLight | None] = (None, None)
             self.filling = 0.0
@@ -162,7 +163,9 @@ def _class(variant: str) -> type:
             # nothing to precompute without objects
             if self.light == "sampled" or not media.objects or not len(media.scene.shapes()):
                 return False
-            reason = obstacle(media)
+            if self._checked[0] is not media:
+                self._checked = media, obstacle(media)
+            reason = self._checked[1]
             if reason and self.light == "precomputed":
                 raise ValueError(f"light must be auto or sampled, got 'precomputed': {reason}")
             # an even sky alone is met by every walk, and light inside would only add its noise

@@ -34,6 +34,7 @@ from full_geometry.geometry.points import (
     Proposals,
     SurfacePoint,
     Transport,
+    area_points,
     cosine_direction,
     opaque,
     surface_point,
@@ -313,10 +314,10 @@ class TranslucentObject:
             return at
         return at._replace(medium=self.textured.at_point(self.geometry, at.p, at.n, face, active))
 
-    @functools.cached_property
+    @property
     def points(self) -> AreaPoints:
         """Uniform points of its surface."""
-        return AreaPoints(self.geometry.shape)
+        return area_points(self.geometry)
 
     def random_places(self, rng: mi.PCG32) -> SurfacePoint:
         """Points uniform over the area, seen along geometric normals: `n_out` is the interpolated one itself."""

@@ -416,7 +416,9 @@ def draw(n: int, rng: mi.PCG32) -> mi.UInt32:
 
 LANES = 2**15
 PATH_LANES = 2**14  # of paths from cameras and emitters: fastest of 2**12 to 2**18 on 2 cores
-GPU_FACTOR = 4  # as many times lanes and samples on CUDA: 1.2 to 1.4 times as fast on an H200
+GPU_FACTOR = (
+    16  # as many times lanes and samples on CUDA: 18 and 25 ns a sample on an H200; by 4 20 and 28, by 1 32 and 49
+)
 ROULETTE_FROM = 8  # scattering events: from 2 on weak channels of ketchup have 10 times the variance, for no time less
 MOST = 2**31 - 1  # scattering events
 

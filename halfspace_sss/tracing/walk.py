@@ -31,7 +31,7 @@ LONG_PATH, VERY_LONG_PATH = 4096, 2**18
 LONG_SURVIVAL, VERY_LONG_SURVIVAL = math.sqrt(0.5), 0.5
 LAUNCH_SECONDS = 0.7  # of a kernel, in which Python hears no interrupt
 FIRST_TURNS, FEWEST_TURNS = 64, 16  # of the loop in a launch
-CUDA_FIRST_TURNS = 2048  # 15 ms on an H100, less than Python takes to record the loop
+CUDA_FIRST_TURNS = 2048  # a few ms on a GPU, less than Python takes to record the loop
 FEW, ONE_PACKET = 0.5, 32  # share of lanes at which those that go on are put together; not below so many
 
 

@@ -17,6 +17,9 @@ from benchmarks import bench_command as cli_bench
 pytestmark = pytest.mark.slow
 
 
+OF_CPU = cli_bench.OF_BACKEND["llvm"]
+
+
 def _invoke(*arguments: str) -> Any:
     return CliRunner().invoke(cli.app, ["bench", *arguments])
 
@@ -36,10 +39,10 @@ def finished(tmp_path_factory: Any) -> tuple[Any, Path]:
 def test_every_part_has_a_file_and_all_are_in_the_json(finished: tuple[Any, Path]) -> None:
     result, folder = finished
     assert result.exit_code == 0
-    names = [f"bench_{part}.csv" for part in cli_bench.PARTS]
+    names = [f"bench_{part}.csv" for part in OF_CPU]
     assert sorted(path.name for path in folder.iterdir()) == sorted([*names, "bench.json"])
     content = json.loads((folder / "bench.json").read_text())
-    for part in cli_bench.PARTS:
+    for part in OF_CPU:
         assert len(content[part]) == len(_rows(folder / f"bench_{part}.csv")) == cli_bench._lengths(quick=True)[part]
 
 
@@ -52,7 +55,7 @@ def test_every_file_is_named_and_progress_goes_to_stderr(finished: tuple[Any, Pa
 
 def test_the_json_says_where_the_numbers_come_from(finished: tuple[Any, Path]) -> None:
     content = json.loads((finished[1] / "bench.json").read_text())
-    assert content["provenance"]["parameters"] == {"quick": True, "parts": list(cli_bench.PARTS)}
+    assert content["provenance"]["parameters"] == {"quick": True, "parts": list(OF_CPU), "backend": "llvm"}
     assert content["provenance"]["versions"]["drjit"]
     assert content["machine"]["threads"] >= 1
     assert content["peak_memory_gib"] > 0.05
@@ -79,6 +82,20 @@ def test_without_mitsuba_volpath_is_left_out_with_a_sentence(tmp_path: Path, mon
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bench.json", "bench_walk.csv"]
 
 
+def test_a_gpu_has_parts_of_its_own_and_refuses_those_of_the_cpu() -> None:
+    assert cli_bench.chosen_parts(None, "cuda") == ["trace", "renders", "edits", "first"]
+    with pytest.raises(ValueError, match="only must be one of trace, .* with --backend cuda, got 'maps'"):
+        cli_bench.chosen_parts(["trace", "maps"], "cuda")
+
+
+@pytest.mark.slow
+def test_traces_and_edits_are_measured_on_a_cpu_too(tmp_path: Path) -> None:
+    assert _invoke("--quick", "--only", "trace", "--only", "edits", "--out", str(tmp_path)).exit_code == 0
+    assert [row["way"] for row in _rows(tmp_path / "bench_edits.csv")] == ["better_dipole, gathered", "walk"]
+    (row,) = _rows(tmp_path / "bench_trace.csv")
+    assert float(row["events_per_s"]) > 1e6
+
+
 @pytest.mark.parametrize(
     ("text", "parts"),
     [
@@ -95,7 +112,7 @@ def test_parts_are_chosen_in_order_and_volpath_brings_the_walk(text: list[str] |
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--only", "walks"], "'walks' is not one of 'walk', 'volpath', 'models', 'maps'"),
+        (["--only", "walks"], "'walks' is not one of 'walk', 'volpath', 'models', 'maps', 'trace'"),
         (["--out", "file"], "folder must be a folder or new, got 'file'"),
     ],
 )
