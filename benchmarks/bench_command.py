@@ -95,7 +95,7 @@ def bench(
 ) -> None:
     """Measure speed: events a second, equal-error time over Mitsuba, models, maps, renders, edits, first images.
 
-    By default the CPU is measured by walk, volpath, models and maps, a GPU by the other parts.
+    The default for a CPU is walk, volpath, models and maps; for a GPU, trace, renders, edits and first.
     """
     from benchmarks.bench import machine, peak_memory
     from halfspace_sss.backend import array_types
