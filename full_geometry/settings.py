@@ -6,7 +6,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from halfspace_sss.checks import check_choice, check_interval
+from halfspace_sss.checks import check_choice, check_count, check_interval
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -62,14 +62,12 @@ class Settings:
         check_interval("tolerance", self.tolerance, 1e-4, 10.0)
         if self.max_depth < -1 or self.max_depth == 0:
             raise ValueError(f"max_depth must be -1 or at least 1, got {self.max_depth}")
-        if self.rr_depth < 1:
-            raise ValueError(f"rr_depth must be at least 1, got {self.rr_depth}")
+        check_count("rr_depth", self.rr_depth, 1)
         if self.entries < 1 and self.entries != AUTOMATIC:
             raise ValueError(f"entries must be at least 1, got {self.entries}")
         check_choice("light", self.light, LIGHTS)
         check_choice("orders", self.orders, ("", *ORDERS))
-        if self.geometry not in GEOMETRIES:
-            raise ValueError(f"geometry must be one of {', '.join(GEOMETRIES)}, got {self.geometry!r}")
+        check_choice("geometry", self.geometry, GEOMETRIES)
         if self.area_share != AUTOMATIC:
             check_interval("area_share", self.area_share, 0.0, 1.0)
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
+from halfspace_sss.checks import check_choice
 from halfspace_sss.lazy import once
 
 if TYPE_CHECKING:
@@ -188,8 +189,7 @@ def array_types(backend: str = "llvm") -> ModuleType:
         ValueError: the name is not a backend.
         BackendError: the backend cannot run on this machine.
     """
-    if backend not in BACKENDS:
-        raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
+    check_choice("backend", backend, BACKENDS)
     if backend == "llvm":
         prepare_llvm()
     import drjit as dr

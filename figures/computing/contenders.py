@@ -171,7 +171,6 @@ def reference_shot(result: Result, label: str = "Path traced") -> tuple[Shot, np
 
     Args:
         result: of a part that gave `reference_image`.
-        label: of the image.
     """
     image, mask = result.images["image"], result.images["cover"] > 0.5
     stops = stops_of(image, mask)

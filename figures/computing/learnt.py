@@ -99,7 +99,6 @@ def object_parts(name: str, resolution: int, folder: Path, seed: int = 0) -> Sce
 
     Args:
         name, resolution: as in `train_modelled`.
-        folder: for its files.
         seed: of everything uneven about it.
     """
     if name == "candle":

@@ -126,8 +126,7 @@ ENVIRONMENTS = ("studio", "sunset", "forest")
 
 def environment_file(name: str) -> Path:
     """The file of an environment map, for `Part.inputs`; ValueError if there is none of that name."""
-    if name not in ENVIRONMENTS:
-        raise ValueError(f"environment must be one of {', '.join(ENVIRONMENTS)}, got {name!r}")
+    check_choice("environment", name, ENVIRONMENTS)
     return Path(__file__).parents[1] / "assets" / f"{name}.exr"
 
 
@@ -158,7 +157,6 @@ def long_render(task: Task, scene: mi.Scene, spp_per_pass: int, passes: int, hal
 
     Args:
         task: whose parameter "seed" is that of the first pass.
-        scene: Mitsuba scene.
         spp_per_pass, passes: samples per pixel of each pass, and their number.
         half: 1 for another image of other random numbers.
     """

@@ -86,7 +86,6 @@ def pass_size(scene: mi.Scene, seconds: float, seed: int = 0) -> int:
     """Samples per pixel of a pass that takes so many seconds or half as many; its kernels are compiled then.
 
     Args:
-        scene: Mitsuba scene.
         seconds: aimed at; one sample per pixel may take longer.
         seed: of what is rendered for it.
 
@@ -128,7 +127,6 @@ def alternating(
     Args:
         scenes: by name; compiled before, e.g. by `pass_size`.
         spp: of a pass, by name.
-        seed: of the run.
         passes: of each scene.
         seconds: of each scene; it ends with the pass that comes nearest.
         progress: called with (done, in all).

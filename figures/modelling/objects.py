@@ -30,6 +30,7 @@ from full_geometry.learning.meshes import (
     smoothstep,
     surface,
 )
+from halfspace_sss.checks import check_choice
 from halfspace_sss.materials.files import parse
 from halfspace_sss.materials.material import Material
 from halfspace_sss.provenance import write_atomically
@@ -145,8 +146,7 @@ def _tissues() -> dict[str, Material]:
 
 def tissue(name: str) -> Material:
     """What an object is made of, with its source; ValueError if there is none of that name."""
-    if name not in _tissues():
-        raise ValueError(f"tissue must be one of {', '.join(_tissues())}, got {name!r}")
+    check_choice("tissue", name, _tissues())
     return _tissues()[name]
 
 
@@ -264,8 +264,7 @@ def make_varying(name: str, resolution: int = 192, grid_resolution: int = 160, s
     Raises:
         ValueError: no such object, or a resolution is too small.
     """
-    if name not in VARYING:
-        raise ValueError(f"object must be one of {', '.join(VARYING)}, got {name!r}")
+    check_choice("object", name, VARYING)
     make, box = _MODELS[name]
     result = make(seed)
     mesh, grid = surface(result.distance, box, resolution), mixed(result.tissues, box, grid_resolution)
@@ -303,7 +302,6 @@ def learnable_parts(result: Varying, folder: Path) -> SceneDict:
     """An object whose medium varies with the surface `translucent` and a smooth boundary, so that it can be learnt; mm.
 
     Args:
-        result: the object.
         folder: where its PLY file and its grid volumes are written.
     """
     path = result.mesh.write_ply(Path(folder) / f"{result.name}.ply")

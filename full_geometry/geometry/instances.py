@@ -40,7 +40,6 @@ class Group:
     """A group that instances show.
 
     Args:
-        shapes: in it.
         instances: of it, at least one.
         to_world: array (n, 4, 4), of each instance.
     """
@@ -403,7 +402,6 @@ class InstanceProposals:
 
     Args:
         proposals: `points.Proposals` of the shape.
-        transform: of the instance.
     """
 
     proposals: Proposals
@@ -429,11 +427,7 @@ class InstanceProposals:
 
 @dataclass(frozen=True, eq=False)
 class InstanceTransport(TransportAround):
-    """S of a learnt object in the frame of the group, which an instance moves, turns or mirrors.
-
-    Args:
-        transform: of the instance.
-    """
+    """S of a learnt object in the frame of the group, which an instance moves, turns or mirrors."""
 
     transform: InstanceTransform
 

@@ -395,7 +395,6 @@ class Transport(Protocol):
         Args:
             exit: from `prepare`.
             at: entry, with w_i.
-            active: mask of lanes.
         """
 
     def paint(self, at: SurfacePoint) -> mi.Spectrum:
@@ -404,11 +403,7 @@ class Transport(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class TransportAround:
-    """A transport that wraps another one and takes its properties.
-
-    Args:
-        transport: the other one.
-    """
+    """A transport that wraps another one and takes its properties."""
 
     transport: Transport
     is_delta = False
@@ -449,7 +444,6 @@ class PositionSampler:
     """Points of entry of one object.
 
     Args:
-        geometry: of the object.
         table: radial density about the exit.
         points: uniform points of the object.
         area_share: share s of the candidates that are uniform over the area: s/(1 - s) of them, rounded up, beside a
@@ -639,11 +633,7 @@ class Point(NamedTuple):
 
 
 class AreaPoints:
-    """Uniform points of a shape; for a mesh by its faces, as Mitsuba gives one of the two normals only.
-
-    Args:
-        shape: the Mitsuba shape.
-    """
+    """Uniform points of a shape; for a mesh by its faces, as Mitsuba gives one of the two normals only."""
 
     def __init__(self, shape: mi.Shape) -> None:
         self.shape = shape

@@ -156,9 +156,7 @@ def path_numbers(seed: int, pixels: int, first: int, spp: int) -> mi.Sampler:
 
     Args:
         seed: images of different seeds are independent.
-        pixels: of the image.
         first: number of the first sample of a pixel; those before it have been taken.
-        spp: samples of each pixel.
     """
     return _numbers_class(mi.variant())(seed, pixels, first, spp)
 

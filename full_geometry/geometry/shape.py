@@ -173,7 +173,6 @@ class Geometry:
     """A shape with a translucent surface.
 
     Args:
-        shape: the Mitsuba shape.
         scene: a scene that holds this shape only.
         sign: 1 if its geometric normals point outwards, -1 if inwards.
         signs: Float array of the same for each face, or None if it is the same for all.
@@ -280,7 +279,6 @@ def analyse_shape(shape: mi.Shape, world: mi.Scene | None = None, groups: Iterab
     Faces of a closed mesh that point to both sides are taken the right way round.
 
     Args:
-        shape: of Mitsuba.
         world: the scene that it stands in, if rays are traced in both by one kernel.
         groups: `instances.Group` of each group that instances in the scene show.
 
@@ -550,7 +548,6 @@ def scene_of(shapes: list[mi.Shape], world: mi.Scene | None = None) -> mi.Scene:
     """A Mitsuba scene that holds these shapes, which keep their ids.
 
     Args:
-        shapes: of Mitsuba.
         world: the scene that they stand in, if rays are traced in both by one kernel or one is an instance. It is not
             kept alive, and must not be one that this function made.
     """

@@ -34,7 +34,6 @@ class Snapshot:
         """Take the snapshot of an object and all that it holds.
 
         Args:
-            root: of Mitsuba.
             wanted: whether a parameter of this name counts; by default all do.
             without: classes of objects that do not count.
         """

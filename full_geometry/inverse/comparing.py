@@ -307,7 +307,6 @@ class ViewComparison:
         """Compare a view with its image in step k; a view that is held out takes the exposure that suits it best.
 
         Args:
-            which: number of the view.
             k: number of the step, which seeds the renders.
             pair: two renders of the view, if there are any; by default they are made.
         """

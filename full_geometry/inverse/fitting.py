@@ -179,7 +179,6 @@ class MediumDescent:
 
     Args:
         comparison: of the scene with images.
-        parameters: what is fitted.
     """
 
     def __init__(self, comparison: ViewComparison, parameters: FitParameters) -> None:

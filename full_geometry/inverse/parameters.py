@@ -110,7 +110,6 @@ class FitParameters:
 
     Args:
         names: of `NAMES`.
-        shape: the object.
         sizes: bounds of sigma_t, 1/mm.
     """
 

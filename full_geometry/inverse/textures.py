@@ -84,7 +84,6 @@ class Variable:
     """A texture or a constant that is fitted, in variables without bounds.
 
     Args:
-        name: of the parameter.
         key: of the numbers in `mitsuba.traverse`.
         kind: of the numbers there.
         start: these numbers, shape (rows, columns, channels), (n, channels) or (channels,).
@@ -196,7 +195,6 @@ class Variable:
         """Numbers of texels at points of the surface, and their weights there, both of shape (k, points).
 
         Args:
-            shape: the object.
             si: the points.
             corner: their barycentric coordinates in their face.
         """
@@ -246,7 +244,6 @@ class TextureParameters:
     """The textures and constants of one object that are fitted.
 
     Args:
-        shape: the object.
         variables: textures and constants.
     """
 
@@ -429,7 +426,6 @@ class TextureDescent:
 
     Args:
         comparison: of the scene with images.
-        parameters: what is fitted.
     """
 
     def __init__(self, comparison: ViewComparison, parameters: TextureParameters) -> None:

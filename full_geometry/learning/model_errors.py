@@ -121,9 +121,7 @@ def modelled(
     """Radiance of exits by a model.
 
     Args:
-        transport: the model.
         proposals: where its entries are drawn.
-        exits: from a reference.
         samples, seed: entries of each exit; of the entries.
     """
     n = dr.width(exits.p)
@@ -197,12 +195,10 @@ def measure(
     """The error of a transport of an object, per channel, under constant light and lobes.
 
     Args:
-        obj: the object.
         transport: its S.
         proposals: where entries are drawn.
         truth: from `reference`, of the orders of the transport; made anew by default.
         samples: entries of each exit.
-        seed: of everything.
     """
     check_count("samples", samples, 2)
     truth = truth or reference(obj, seed=seed, fewest=FEWEST[transport.orders])
@@ -234,7 +230,6 @@ def errors_of(
     Those that have learnt what uniform light leaves have the error of images under an even sky too.
 
     Args:
-        obj: the object.
         transports: by name.
         exits, seed: number of exits; of everything.
         walks, samples: of each exit, for the truth and for the models.
@@ -343,8 +338,6 @@ def mean_ratios(scene: mi.Scene, image: np.ndarray, sensor: int = 0, seed: int =
     Args:
         scene: whose integrator tells mm_per_unit and max_depth.
         image: (height, width, channels) radiance by a model, of the whole crop.
-        sensor: its number.
-        seed: of places and walks.
 
     Raises:
         ValueError: the scene cannot be walked.

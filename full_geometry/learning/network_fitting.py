@@ -96,8 +96,6 @@ class Correction(NamedNetwork):
     Args:
         n_in: features.
         channels: outputs.
-        width, depth: hidden layers.
-        seed: of the initial weights.
     """
 
     NAMES = ("W", "b")
@@ -133,10 +131,8 @@ class AlbedoNetwork(NamedNetwork):
 
     Args:
         n_in: features of an exit.
-        channels: of the medium.
         hidden: widths of the hidden layers.
         eta: relative index.
-        seed: of the initial weights.
     """
 
     NAMES = ("A", "a")
@@ -198,7 +194,6 @@ class PatchLogits(NamedNetwork):
         n_in: features of an exit.
         areas: of the patches.
         hidden: widths of the hidden layers.
-        seed: of the initial weights.
     """
 
     NAMES = ("V", "c")
@@ -275,7 +270,6 @@ class ObjectFit:
 
     Args:
         n_in: features of a pair.
-        channels: of the medium.
         eta: relative index.
         recipe: sizes and rates.
         seed: of the initial weights and of the order of the data.
@@ -369,7 +363,6 @@ class ObjectFit:
         Args:
             source: of the proposals.
             chunks: of the training; half as many are made.
-            seed: of the training.
         """
         for k in range(max(round(SOLVED * chunks), 1)):
             made = source.proposed(PROPOSED * self.recipe.chunk, (seed, BEYOND + k))
@@ -462,9 +455,7 @@ class Ends:
     """Sums over walks and proposals of some channels.
 
     Args:
-        channels: of the medium.
         n: features of a side.
-        device: of everything.
     """
 
     def __init__(self, channels: int, n: int, device: torch.device) -> None:

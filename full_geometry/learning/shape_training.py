@@ -60,7 +60,6 @@ class ShapeRecipe:
     """How the network is fitted.
 
     Args:
-        width, depth: hidden layers.
         objects: of a batch.
         pairs: walks, and proposals, of each; at least two.
         rate: largest learning rate.
@@ -91,12 +90,7 @@ class LearntShapes(NamedTuple):
 
 
 class ShapeNetwork(nn.Module):
-    """f of `NeuralShape` in torch; 0 initially.
-
-    Args:
-        recipe: its size.
-        seed: of the initial weights.
-    """
+    """f of `NeuralShape` in torch; 0 initially."""
 
     def __init__(self, recipe: ShapeRecipe, seed: int = 0) -> None:
         super().__init__()
@@ -142,7 +136,6 @@ class ShapeFit:
 
     Args:
         recipe: sizes and rates.
-        seed: of the initial weights.
     """
 
     def __init__(self, recipe: ShapeRecipe, seed: int) -> None:
@@ -160,7 +153,6 @@ class ShapeFit:
 
         Args:
             pool: data to draw from.
-            rng: that draws.
             part: of the whole fit that is done, for the decay of the rate.
         """
         loss = self.loss([pool[k] for k in rng.integers(0, len(pool), self.recipe.objects)], rng)
@@ -228,9 +220,7 @@ def train_shapes(
     is started again with the same `work` ends with the same weights.
 
     Args:
-        folder: for the weights.
         seconds: for data and fit, after the kernels are compiled.
-        seed: of everything.
         meshes: closed PLY files among the shapes.
         recipe: sizes and rates.
         plan: numbers of objects and steps instead of a plan by time.
@@ -374,7 +364,6 @@ class Drawn:
 
     Args:
         family: of the shape, or the name of the mesh.
-        obj: the object.
     """
 
     family: str
@@ -485,7 +474,6 @@ def make_data(obj: TranslucentObject, events: float, seed: tuple[int, ...]) -> P
     Args:
         obj: the object, of one channel or of equal ones.
         events: of a walk, about, which limits the number of walks.
-        seed: of all of it.
     """
     n = int(np.clip(EVENTS / events, FEWEST_WALKS, WALKS))
     starts = obj.random_points(generator(mi, n, pass_seed(*seed, 0)))

@@ -68,7 +68,6 @@ def trusted(
         truth: exits and walks of orders from two on.
         errors: of S there.
         walks: of each exit, for order one.
-        seed: of them.
     """
     once = traced(model.object, truth.exits, walks, seed, fewest=1, most=1)
     parts = model.alpha.parts(truth.exits)
@@ -123,9 +122,7 @@ class CameraExits:
 
     Args:
         source: of the pairs.
-        camera: walks from the camera.
         walks: of a chunk, those of the camera included.
-        seed: of the run.
     """
 
     def __init__(self, source: PairSource, camera: CameraWalks, walks: int, seed: int) -> None:
@@ -143,12 +140,7 @@ class CameraExits:
         return (time.monotonic() - started) * self.schedule.passes / self.schedule.every
 
     def data(self, k: int, proposed: int) -> tuple[Pairs, Pairs]:
-        """Walks and proposals of chunk k.
-
-        Args:
-            k: number of the chunk.
-            proposed: number of proposals.
-        """
+        """Walks and proposals of chunk k."""
         seed, order = (self.seed, k), np.random.default_rng([self.seed, k, 1])
         parts = []
         if self.schedule:
@@ -227,7 +219,6 @@ class TrainingPlan:
     Args:
         seconds: for data, fit and validation, after the kernels are compiled; 0 gives the base model, with a warning.
         target_error: stop once the largest error under constant light has come down to it.
-        seed: of everything.
         recipe: sizes and rates.
         chunks: number of chunks instead of a plan by time.
         base_model: `neural_shape` or a half-space model, with its rate; by default the recipe's.
@@ -314,8 +305,6 @@ def train_unattended(
     """Learn an object without errors on the way, in seconds of CPU time whatever else the machine does, or by chunks.
 
     Args:
-        obj: the object.
-        folder: for the weights.
         cpu_seconds: of this process, for data and fit; errors at the end take more.
         chunks: instead, each of `recipe.chunk` walks that are kept, so that the clock has no part in the weights.
         seed, recipe: of everything; sizes and rates.

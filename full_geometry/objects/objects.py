@@ -222,7 +222,6 @@ class TranslucentObject:
     """One translucent object; of one that is not rendered geometry and medium alone are known.
 
     Args:
-        geometry: of its shape.
         media: scalar medium of each channel of the variant, 1/(scene unit).
         varying: how its medium varies in space, 1/(scene unit); `media` are then a homogeneous equivalent.
         textured: likewise over its surface.
@@ -399,7 +398,6 @@ def check_size(geometry: Geometry, sigma_t: Sequence[float], mm_per_unit: float)
     """Warn of an object whose size in mean free paths speaks of another unit of length.
 
     Args:
-        geometry: the object.
         sigma_t: of each channel, 1/(scene unit).
         mm_per_unit: length of a scene unit, mm.
     """

@@ -105,7 +105,6 @@ class SmallEmitters:
     """The emitters of a scene that may look small from an object, each addressed by its number.
 
     Args:
-        scene: the Mitsuba scene.
         emitters: those with a place of their own or a direction: delta lights first.
         n_delta: how many are delta lights.
         suns: cones of the environment; their numbers follow.

@@ -32,10 +32,7 @@ class CameraWalks:
     image holds already, as after a run that was killed, is traced again for its exits only.
 
     Args:
-        scene: with the sensor.
         settings: of the integrator `bssrdf`.
-        sensor: number of the sensor.
-        seed: of the run.
         path: of the image, an EXR as of `reference.render`; gone on with if it is there.
         about: what is rendered, see `Reference.about`.
         progress: called with the image after each pass.
@@ -74,9 +71,7 @@ class CameraWalks:
         """First exits of the paths that meet an object first, from a pass of spp samples per pixel.
 
         Args:
-            shape: the object.
             number: of the pass; `TRIAL` for one that is no part of the image.
-            spp: samples per pixel.
         """
         name, kept = shape.id(), []
         media = self.integrator.tracer(self.scene).visitor.media

@@ -36,12 +36,9 @@ class Reference:
     Args:
         mean: image, float64, shape (height, width, channels).
         variance: of the mean, per pixel and channel, from the spread of the passes; zero after one pass.
-        passes: number of passes.
         spp: samples per pixel of all passes together.
-        seconds: time spent on them.
         about: what was rendered: scene (hash), integrator, seed, and provenance.
         half: mean of the passes of one half, float64, shape of `mean`; None where no half is kept.
-        half_spp: their samples per pixel.
     """
 
     mean: np.ndarray

@@ -362,7 +362,6 @@ def promising(
         ahead: techniques that have been run.
         later: those whose light has to be gathered before, or that take long to run.
         job: that the cheapest is looked for.
-        seconds: of the assessment.
         references: walks that biases are measured against.
     """
     names = {name for o in seen for name in contenders(o, job.tolerance)}

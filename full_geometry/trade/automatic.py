@@ -134,7 +134,6 @@ class Pick(NamedTuple):
     """A model for an object.
 
     Args:
-        model: its name.
         seconds: of an image by it; infinite if it is not known to keep the tolerance.
         sentence: why.
         keeps: whether it is known to keep the tolerance.
@@ -203,7 +202,6 @@ def decided(scene: mi.Scene, settings: Settings, ways: Sequence[str]) -> Decisio
     """The cheapest of some ways for one image, as `recommend` finds it.
 
     Args:
-        scene: the Mitsuba scene.
         settings: of the integrator; the tolerance is theirs.
         ways: names of techniques.
 

@@ -83,7 +83,6 @@ class Denoiser:
     """A denoiser of renders of a scene, led by its albedo and normals.
 
     Args:
-        scene: of Mitsuba.
         sensor: of Mitsuba, or its number.
         integrator: that renders; None for the one of the scene.
         spp: samples of albedo and normals.

@@ -34,12 +34,8 @@ def small_images(
     """Linear images (H, W, 3) of the ways that do not refuse the scene, by name; one seed for all.
 
     Args:
-        on: the scene.
         chosen: ways.
-        sensor: number of the sensor.
-        seed: of the samples.
         side: longest side, pixels.
-        spp: samples for each pixel.
     """
     camera = on.scene.sensors()[sensor]
     film = camera.film()
@@ -133,10 +129,8 @@ def denoised_rows(
     The row of an object is of the fewest samples of a pixel that keep the tolerance, of the most if none does.
 
     Args:
-        on: the scene.
         technique: denoised walks.
         found: mean radiance of each object, and the row of the same walks as they are; None where it is not seen.
-        budget: of the measurement.
     """
     # ---- tiles of the image, with guides and covers of objects
     camera, tolerance = on.scene.sensors()[budget.sensor], budget.tolerance or 0.0
@@ -277,13 +271,8 @@ def with_flip(
     """The assessment with FLIP of the whole small image, where the evaluator is installed and something shines.
 
     Args:
-        on: the scene.
         chosen: ways, path traced first.
-        assessment: the assessment.
-        sensor: number of the sensor.
-        seed: of the samples.
         images: of `small_images`, if they have been rendered, with `spp` samples a pixel.
-        spp: samples for each pixel.
     """
     if find_spec("flip_evaluator") is None or all(o.is_dark for o in assessment.objects):
         return assessment
@@ -315,7 +304,6 @@ class TradePicture:
     """A trade to be drawn.
 
     Args:
-        title: of the scene.
         found: what was measured.
         tolerance: that was asked.
         sentences: of the recommendation.
@@ -335,7 +323,6 @@ def picture_of(
     """The picture of a recommendation for a scene file, whose images are rendered for it.
 
     Args:
-        file: the scene.
         assessment: what was measured.
         tolerance: that was asked.
         sentences: of the recommendation.

@@ -82,12 +82,9 @@ class SceneSamples:
     """The samples that have been taken of the objects of a scene.
 
     Args:
-        on: the scene.
-        effort: of the assessment.
         started: when, by `clock`.
         points: of each object; None where it is hardly seen.
         sampled: of each object by each technique.
-        heard: warnings.
         mfp: mean free paths across, smallest and largest of the channels.
         denoised: of each object by denoised walks.
     """

@@ -165,12 +165,7 @@ def sample_more(
     """Sample further, for so many seconds or a number of samples of each exit.
 
     Args:
-        stage: the scene.
-        way: how it is rendered.
-        exits: of the object.
         sampled: what is there already.
-        seed: of the samples.
-        seconds: to spend.
         samples: of each exit, instead; the outcome then depends on the seed alone.
     """
     most, started = max(LANES // exits.n, 2), clock()
@@ -197,9 +192,6 @@ def sample_blur(stage: Stage, exits: Exits, seed: int, samples: int) -> Radiance
     Those are the same paths with and without it, the cone so wide that few samples tell.
 
     Args:
-        stage: the scene.
-        exits: of the object.
-        seed: of the samples.
         samples: of each exit.
     """
     techniques = [Technique(PATH_TRACED, blur=blur) for blur in (0.0, BLUR)]
@@ -257,10 +249,7 @@ def radiance(scene: mi.Scene, integrator: mi.Integrator, sampler: mi.Sampler, ra
     It is evaluated at once, as sums evaluate what they are given and would trace all paths for each channel anew.
 
     Args:
-        scene: to look at.
-        integrator: of a way.
         sampler: of a number for each ray at a time.
-        ray: all of them.
     """
     L = _recorded(scene, integrator, sampler, ray)
     dr.eval(L)
@@ -325,11 +314,7 @@ def visible_exits(scene: mi.Scene, shapes: list[mi.Shape], sensor: int, n: int, 
     """Find n rays of a sensor that meet each shape first; fewer where it is hardly seen, None where it is not.
 
     Args:
-        scene: the Mitsuba scene.
-        shapes: of it.
-        sensor: number of the sensor.
         n: rays of each.
-        seed: of the rays.
     """
     camera = scene.sensors()[sensor]
     pixels = int(np.prod(np.array(camera.film().crop_size())))

@@ -110,8 +110,6 @@ class Stage:
     """A loaded scene, and the integrators of several techniques for it.
 
     Args:
-        scene: the Mitsuba scene.
-        shapes: its translucent shapes.
         settings: of its integrator, by parameter name.
         bssrdf: parameters that `bssrdf` alone understands.
         paces: first `Sampled` of earlier runs by (object, technique), so that the next run knows what a sample takes.
@@ -231,7 +229,6 @@ class Effort:
         samples: of each exit by each technique, in place of seconds; the outcome then depends on the seed alone.
         exits: points of each object.
         traced: share of the time for walks.
-        sensor: number of the sensor.
         seed: of everything; what depends on the clock is how many samples are taken.
     """
 

@@ -91,7 +91,6 @@ class Backbone(HalfSpace):
     """S_0 P_o P_i per channel.
 
     Args:
-        obj: the object.
         mixtures: what each of its channels mixes.
         precise: as of `HalfSpace`.
     """
@@ -158,7 +157,6 @@ class NeuralShape(Transport):
     positive; 0 below the horizons.
 
     Args:
-        obj: the object.
         half_space: S_0 P_o P_i.
         weights: W_k (outputs, inputs) and b_k of the layers.
         media: numbers of each channel.
@@ -224,7 +222,6 @@ class NeuralShape(Transport):
         Args:
             exit: from `prepare`.
             at: entry, with w_i.
-            active: mask of lanes.
         """
         return self(exit, self.end(at, active), active)
 

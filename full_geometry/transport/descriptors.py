@@ -192,10 +192,8 @@ def look(obj: TranslucentObject, at: SurfacePoint, event: FirstEvent, active: mi
     """Surroundings of the first events of each channel; channels of the same extinction share them.
 
     Args:
-        obj: the object.
         at: points of its surface, with the directions outside that light goes along.
         event: their first events.
-        active: mask of lanes.
     """
     known: dict[tuple[float, float], RaySurroundings] = {}
     for m, y in zip(obj.media, event.ys):

@@ -141,7 +141,6 @@ class EntryProposals:
     weight v by a probe alone counts v D / ((1 - s) D + s q), one of a patch 1 / ((1 - s) D + s q).
 
     Args:
-        obj: the object.
         base: whose radial densities the probes follow.
         area_share: of the candidates that are uniform over the area, without patches.
         patches: learnt weights, or None.
@@ -191,8 +190,6 @@ class PairSource:
     """Makes training data.
 
     Args:
-        obj: the object.
-        frame: of its features.
         base: base model S_0, which values of proposals have.
         proposals: where they come from.
         scale: of T of each channel, one over its mean; without it every walk that left is kept.
@@ -226,7 +223,6 @@ class PairSource:
 
         Args:
             starts, exits: of the walks.
-            seed: of what is kept.
         """
         n, albedo = dr.width(starts.p), self._albedo_samples(starts, exits)
         T = dr.select(exits.order == 1, 0, exits.T)
@@ -256,7 +252,6 @@ class PairSource:
 
         Args:
             n: how many.
-            seed: of them.
             starts: n exits that they are of; by default random ones.
         """
         rng = generator(mi, n, pass_seed(*seed, 2))

@@ -229,7 +229,6 @@ def surroundings(obj: TranslucentObject, frame: ObjectFrame, turns: np.ndarray |
     """The fields of an object.
 
     Args:
-        obj: the object.
         frame: a `ObjectFrame` of its features.
         turns: those of training; by default made from random points.
     """
@@ -439,7 +438,6 @@ def entering(columns: Sequence[Lanes], eta: Lanes | float, channels: int) -> tup
     Args:
         columns: features of a side, of NumPy, torch or Dr.Jit.
         eta: relative index.
-        channels: of the medium.
     """
     lib, mu = library(columns[MU]), columns[MU]
     F_t = fresnel.F_t(lib.maximum(mu, 0 * mu), eta)

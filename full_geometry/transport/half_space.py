@@ -84,7 +84,6 @@ class HalfSpaceProposals(Proposals):
     """Points by probes and over the area, directions by a model.
 
     Args:
-        positions: of entries.
         model: whose directions of incidence are drawn.
         textured: a medium that entries are to know, 1/(scene unit), or None.
     """
@@ -119,8 +118,6 @@ def half_space_model(name: str, geometry: Geometry, media: Sequence[Medium], set
     """The transport and the proposals of a half-space model on an object.
 
     Args:
-        name: of the model.
-        geometry: the object.
         media: of each channel, 1/(scene unit).
         settings: geometry and share of uniform entries.
     """
@@ -168,9 +165,7 @@ def check_turns(geometry: Geometry, media: Sequence[Medium], model: str) -> None
     """ValueError if more than `MOST_STRAIGHT` of the light passes straight through an object, which `model` lacks.
 
     Args:
-        geometry: of the object.
         media: of each channel, 1/(scene unit).
-        model: a name.
     """
     share = float(straight_share(geometry, media).max())
     if share > MOST_STRAIGHT:

@@ -47,7 +47,6 @@ class HalfSpace:
     Where media have textures S_0 is that of the medium of the exit, and the floor a share of its reflectance.
 
     Args:
-        obj: the object.
         model: name of a half-space model.
         floor: reflectance of the floor, over that of the half-space.
         precise: the model is asked `in_double`, for differences.
@@ -119,8 +118,6 @@ class DirectionalAlbedo:
     """The directional albedo of one object.
 
     Args:
-        obj: the object.
-        frame: of the features.
         weights: A_k (outputs, inputs) and a_k of the layers.
         trusted: (2, channels) from `learning.training.trusted`.
     """
@@ -175,8 +172,6 @@ class FullGeometry(Transport):
     Orders two and more; positive; reciprocal as far as it has been learnt.
 
     Args:
-        obj: the object.
-        frame: of the features.
         base: S_0.
         weights: W_k (outputs, inputs) and b_k of the layers, Q of h.
         alpha: ∫ S mu_i of an exit, learnt beside S.
@@ -213,7 +208,6 @@ class FullGeometry(Transport):
         Args:
             exit: from `prepare`.
             at: entry, with w_i.
-            active: mask of lanes.
         """
         entry, net = self.base.end(entered(at, exit.side.at), active), self._network
         features, h = self._end(entry)

@@ -157,7 +157,6 @@ class Palette:
         """The palette of a model.
 
         Args:
-            name: of it.
             albedos: that nodes have to cover, shape (n, channels).
             extinctions: of all places, shape (n, channels).
             media: of each channel; their g and eta hold.
@@ -437,7 +436,6 @@ class PaletteTransport(Transport):
 
     Args:
         palette: the models.
-        obj: the object.
         medium: what varies, 1/(scene unit).
         geometry: "distance" or "tangent", see `points.separation`.
     """
@@ -475,8 +473,6 @@ def palette_model(
     """The transport and the proposals of a half-space model on an object whose medium has textures or spectra.
 
     Args:
-        name: of the model.
-        geometry: the object.
         media: of each channel, 1/(scene unit); their g and eta hold.
         medium: what varies, 1/(scene unit).
         settings: geometry and share of uniform entries.

@@ -90,8 +90,6 @@ class Patches:
     """Faces by patch, and uniform points of a patch.
 
     Args:
-        obj: the object, a mesh.
-        frame: its frame.
         centres: from `cluster`, of this object or of the one that was trained.
     """
 
@@ -143,7 +141,6 @@ class PatchSampler:
     """Points of entry by learnt weights of patches.
 
     Args:
-        frame: of the object.
         patches: of its surface.
         weights: V_k (outputs, inputs) and c_k of the layers; the last has one output for each patch.
     """

@@ -185,7 +185,6 @@ class TranslucentObjects:
     """The objects of the scene that was asked for last, made anew when its objects, their shape or media changed.
 
     Args:
-        settings: of the integrator.
         choose: says what stands for "auto".
     """
 
@@ -227,8 +226,6 @@ def make_objects(
     """All objects of a scene that have a `translucent` surface, but for those in others or with the ids in `without`.
 
     Args:
-        scene: of Mitsuba.
-        settings: of the integrator.
         chosen: what stands for "auto"; may be left out where no object has that model.
         without: ids.
 

@@ -177,7 +177,6 @@ def _contents(obj: TranslucentObject, anchors: np.ndarray) -> tuple[str, list[np
     """Digest of what lies inside, in an order that the order in the scene has no part in, and anchors of each.
 
     Args:
-        obj: the object.
         anchors: its own; of those that are alike inside, the nearest to the first of them comes first.
     """
     inclusions, results = obj.geometry.inclusions, []
@@ -276,7 +275,6 @@ def frame_of(obj: TranslucentObject, trained: Identity | None = None, turns: np.
     """The frame of the features; that of training for an object that has been moved since.
 
     Args:
-        obj: the object.
         trained: as it was trained.
         turns: of its surroundings then.
 
@@ -376,7 +374,6 @@ def nearest(
     Args:
         obj: the object; weights are of homogeneous media with nothing inside.
         recipe: of its training; sizes and base model must be those of the weights.
-        folder: of weights.
     """
     here, found = identify(obj), []
     if here.grids or here.contents or here.textures:

@@ -59,7 +59,6 @@ def exits(model: BSSRDF, mu_i: Sequence[float | str], points: int, seed: Sequenc
     Args:
         model: of a scalar medium; evaluated in single precision.
         points: of each of the three proposals, a power of two; scrambled Sobol points, others for each row.
-        seed: of the scrambles.
     """
     rows = [_draw(model, mu, points, (*seed, k)) for k, mu in enumerate(mu_i)]
     p = _Points(*(np.stack(values) for values in zip(*rows)))

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from halfspace_sss.arrays import library
+from halfspace_sss.checks import check_count
 from halfspace_sss.neural.universal import RANGES
 from halfspace_sss.physics.backbone import length_scale, unwarp, warp
 from halfspace_sss.physics.medium import Medium
@@ -36,9 +37,7 @@ class MapGrid:
 
     def __post_init__(self) -> None:
         for name, least in (("n_theta", 1), ("n_phi", 16), ("n_r", 2), ("n_psi", 2)):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < least:
-                raise ValueError(f"{name} must be a whole number >= {least}, got {value!r}")
+            check_count(name, getattr(self, name), least)
         if self.n_theta > MOST_THETA:
             raise ValueError(f"n_theta must be at most {MOST_THETA}, got {self.n_theta}")
         cells = self.n_phi * self.n_r * self.n_psi

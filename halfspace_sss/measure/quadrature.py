@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from halfspace_sss.checks import check_count
 from halfspace_sss.physics.fresnel import mu_external
 from halfspace_sss.physics.medium import Medium
 
@@ -35,8 +36,7 @@ class Quadrature:
 
     def __post_init__(self) -> None:
         for name, least in (("per_decade", 4), ("n_azimuth", 4), ("n_mu", 2)):
-            if not getattr(self, name) >= least:
-                raise ValueError(f"{name} must be >= {least}, got {getattr(self, name)!r}")
+            check_count(name, getattr(self, name), least)
         if self.n_azimuth % 2:
             raise ValueError(f"n_azimuth must be even, got {self.n_azimuth!r}")
 

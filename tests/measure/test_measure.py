@@ -235,9 +235,9 @@ def test_the_energy_table_notes_a_model_that_refuses_the_medium():
         (lambda s: measure.moments(s, 2.0), r"mu_i must be in \[0, 1\], got 2.0"),
         (lambda s: measure.reciprocity_gap(s, 0), "n must be >= 1, got 0"),
         (lambda s: measure.energy_table({"m": s.medium}, ["no_such"]), "model must be one of .*'no_such'"),
-        (lambda s: Quadrature(per_decade=1), "per_decade must be >= 4, got 1"),
+        (lambda s: Quadrature(per_decade=1), "per_decade must be a whole number >= 4, got 1"),
         (lambda s: Quadrature(n_azimuth=7), "n_azimuth must be even, got 7"),
-        (lambda s: Quadrature(n_mu=1), "n_mu must be >= 2, got 1"),
+        (lambda s: Quadrature(n_mu=1), "n_mu must be a whole number >= 2, got 1"),
     ],
 )
 def test_bad_arguments_are_refused_with_modelbound_and_value(call, message):

@@ -207,7 +207,6 @@ class Small(nn.Module):
     """log(G/B) of one medium: `Network` as a torch module.
 
     Args:
-        width, depth: hidden layers.
         seed: of the numbers at the start.
         start: network to start from instead.
     """
@@ -281,7 +280,6 @@ class PaperLearner(nn.Module):
     Args:
         medium: scalar, in mean free paths.
         scale: S is divided by it, so that targets are of order one.
-        width, depth: hidden layers.
         seed: of the numbers at the start.
     """
 
