@@ -92,7 +92,7 @@ def fit(
 
 def _write(found: MaterialFit, scene: Path, name: str | None, out: Path, drawers: Drawers | None) -> list[Path]:
     """Write the files of a fit: numbers, then textures and the scene, then the page; their paths."""
-    from halfspace_sss.materials.imports import to_toml
+    from halfspace_sss.materials.catalogue import to_toml
     from halfspace_sss.materials.material import Material
     from halfspace_sss.provenance import provenance, write_together
 

@@ -79,11 +79,11 @@ def materials_import(
     ] = None,
 ) -> None:
     """Import the materials of a file of another program into a material file."""
-    from halfspace_sss.materials.imports import import_materials, to_toml
-    from halfspace_sss.provenance import write_atomically
+    from halfspace_sss.materials.catalogue import write
+    from halfspace_sss.materials.imports import import_materials
 
     result, out = import_materials(file, mm_per_unit), out or Path(f"{file.stem}.toml")
-    write_atomically(out, to_toml(result))
+    write(out, *result)
     say(*(f"{material.name}: {material.medium}" for material in result), f"wrote {out}")
 
 

@@ -1,6 +1,7 @@
 """Measured materials by name: what was published, in 1/mm, with the source of every number.
 
-`names()` lists them, `load(name)` gives a `Material`, `table()` all of them as numbers, and `register()` adds one.
+`names()` lists them, `load(name)` gives a `Material`, `table()` all of them as numbers, `register()` adds one, and
+`write()` makes a file of some.
 Besides the materials that come with the library, the registry reads on first use every `*.toml` in
 
 - the folders (or files) listed in the environment variable HALFSPACE_SSS_MATERIALS, separated as in PATH,
@@ -26,7 +27,7 @@ Optional keys: g (with sigma_s_prime; without it g is taken as 0 and may be chos
 tank_ml (the published dilution), note, and a table [sources] that tells for each quantity where its numbers come from.
 """
 
-from halfspace_sss.materials.catalogue import load, names, register, table
+from halfspace_sss.materials.catalogue import load, names, register, table, write
 from halfspace_sss.materials.material import Material
 from halfspace_sss.materials.spectra import RGBMedium, SpectralMedium, read_spectra
 from halfspace_sss.materials.spheres import SphereSample, from_spheres
@@ -34,5 +35,5 @@ from halfspace_sss.materials.tissues import Skin, Tissue, published_tissue, skin
 
 __all__ = [
     "Material", "RGBMedium", "Skin", "SpectralMedium", "SphereSample", "Tissue", "from_spheres", "load", "names",
-    "published_tissue", "read_spectra", "register", "skin", "table", "tissue",
+    "published_tissue", "read_spectra", "register", "skin", "table", "tissue", "write",
 ]  # fmt: skip

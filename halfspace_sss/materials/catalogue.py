@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import threading
 from collections.abc import Iterable, Iterator, Sequence
@@ -16,6 +17,7 @@ from halfspace_sss.checks import did_you_mean
 from halfspace_sss.extensions import FAILURES, warn_left_out
 from halfspace_sss.materials.material import Material, key_of
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.provenance import write_atomically
 
 if TYPE_CHECKING:
     import pandas
@@ -191,6 +193,57 @@ def register(material_or_path: Material | str | os.PathLike) -> tuple[str, ...]:
         ValueError: a file is refused (file, key, bound and value are named) or a name is taken; nothing is added then.
     """
     return _registry.register(material_or_path)
+
+
+def write(path: str | os.PathLike, *materials: Material) -> None:
+    """Write a material file, which `register` and the registry read again as equal materials.
+
+    Args:
+        path: a .toml file; it is replaced.
+        materials: at least one; they share set, source, channels, assumptions and sources, which a file has once.
+
+    Raises:
+        ValueError: there is no material, the path does not end in .toml, the materials differ in what they must share,
+            or one is diluted: write the pure one.
+    """
+    if not materials:
+        raise ValueError("materials must be at least one, got none")
+    if Path(path).suffix != ".toml":
+        raise ValueError(f"path must end in .toml, got {str(path)!r}")
+    write_atomically(Path(path), to_toml(materials))
+
+
+def to_toml(materials: Sequence[Material]) -> str:
+    """The text that `write` writes: coefficients in 1/mm with all their digits."""
+    first = materials[0]
+    for material in materials:
+        for name in ("set", "source", "channels", "assumptions", "sources"):
+            ours, wanted = getattr(material, name), getattr(first, name)
+            if ours != wanted:
+                raise ValueError(
+                    f"{name} of {material.name!r} must be that of {first.name!r}, {wanted!r}, got {ours!r}"
+                )
+        if material.dilution != 1:
+            raise ValueError(f"dilution of {material.name!r} must be 1 in a file, got {material.dilution!r}")
+
+    def line(key: str, value: object) -> str:
+        return f"{key} = {json.dumps(value, ensure_ascii=False)}"  # texts, lists and numbers are written as in TOML
+
+    lines = [line("set", first.set), line("unit", "1/mm"), line("source", first.source)]
+    lines += [line("channels", first.channels)] if first.channels else []
+    lines += [line("assumptions", first.assumptions)] if first.assumptions else []
+    lines += [line("tank_ml", 1.0)] if any(each.published_dilution for each in materials) else []
+    lines += ["", "[sources]", *(line(key, text) for key, text in first.sources.items())] if first.sources else []
+    for material in materials:
+        m = material.medium
+        scattering = {"sigma_s_prime": m.sigma_s_prime} if material.g_assumed else {"sigma_s": m.sigma_s, "g": m.g}
+        values = {"name": material.name, "eta": m.eta, **scattering, "sigma_a": m.sigma_a}
+        values |= {"sample_ml": material.published_dilution} if material.published_dilution else {}
+        values |= {"dilutable": True} if material.dilutable else {}
+        values |= {"note": material.note} if material.note else {}
+        lines += ["", "[[material]]"]
+        lines += [line(key, v.tolist() if isinstance(v, np.ndarray) else v) for key, v in values.items()]
+    return "\n".join(lines) + "\n"
 
 
 def table() -> pandas.DataFrame:

@@ -203,20 +203,3 @@ def _not_taken_of_gltf(material: pygltflib.Material, parts: dict[str, object]) -
     factors = {key: written[key] for key in none if written.get(key, none[key]) != none[key]}
     textures = {key: "a texture" for key in written if key.endswith("Texture")}
     return factors | textures | {key: value for key, value in parts.items() if key not in TAKEN_OF_GLTF}
-
-
-def to_toml(materials: list[Material]) -> str:
-    """A material file, as the registry reads it, with the RGB materials of one import."""
-    first = materials[0]
-    lines = [f"set = {_quoted(first.set)}", 'unit = "1/mm"', f"source = {_quoted(first.source)}"]
-    lines.append('channels = ["R", "G", "B"]')
-    for material in materials:
-        m = material.medium
-        lines += ["", "[[material]]", f"name = {_quoted(material.name)}", f"eta = {m.eta!r}"]
-        lines += [f"{key} = {np.asarray(getattr(m, key)).tolist()!r}" for key in ("sigma_s", "sigma_a", "g")]
-    return "\n".join(lines) + "\n"
-
-
-def _quoted(text: str) -> str:
-    """A basic string of TOML."""
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

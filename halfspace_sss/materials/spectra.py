@@ -18,7 +18,7 @@ import numpy as np
 from halfspace_sss.checks import check_choice
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.physics.reflectance import DIFFUSE, half_space_reflectance
-from halfspace_sss.provenance import read_text
+from halfspace_sss.provenance import read_text, write_atomically
 
 PER_MM = {"1/mm": 1.0, "1/cm": 10.0}
 SHORTEST = 100.0  # nm, of a medium; less looks like µm
@@ -98,6 +98,12 @@ class SpectralMedium:
             bound = {"g": "in the open interval (-1, 1)", "n": "> 0"}.get(name, ">= 0 (1/mm)")
             _check(name, value, ok, wavelengths, bound)
             object.__setattr__(self, name, value)
+
+    def to_csv(self, path: str | os.PathLike) -> None:
+        """Write the spectra in 1/mm with all their digits, as `read_spectra` reads them."""
+        columns = (self.wavelengths, self.sigma_a, self.sigma_s, self.g, self.n)
+        rows = [",".join(COLUMNS), *(",".join(map(repr, row)) for row in np.transpose(columns).tolist())]
+        write_atomically(Path(path), f"# {self.source}\n" + "\n".join(rows) + "\n")
 
     def medium(self, wavelengths: float | Sequence[float]) -> Medium:
         """The medium at these wavelengths (nm), one channel each; a scalar medium at one number.

@@ -20,11 +20,12 @@ from halfspace_sss.measure.reflected_flux import (
     reciprocity_gap,
     reflectance,
     reflectance_estimate,
+    ring_means,
     weight_variance,
 )
 
 __all__ = [
     "Integral", "Moments", "Quadrature", "ReciprocityGap", "ReducedCoefficients", "clamped_energy",
     "coefficients_of_frequencies", "energy_table", "frequency_reflectance", "moments", "profile", "reciprocity_gap",
-    "reflectance", "reflectance_estimate", "weight_variance",
+    "reflectance", "reflectance_estimate", "ring_means", "weight_variance",
 ]  # fmt: skip

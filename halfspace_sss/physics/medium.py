@@ -364,7 +364,14 @@ class HasMedium(Protocol):
 
 
 def medium_of(given: Medium | HasMedium) -> Medium:
-    """The medium of a material; anything else as it is."""
+    """The medium of a material; anything else as it is, but for names, of which `materials` has the list.
+
+    Raises:
+        ValueError: it is a name.
+    """
+    if isinstance(given, str):
+        hint = f"`halfspace_sss.materials.load({given!r})` has the material of a name"
+        raise ValueError(f"medium must be a Medium or a Material, got {given!r}; {hint}")
     return given.medium if isinstance(given, HasMedium) else given
 
 

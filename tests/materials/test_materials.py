@@ -7,6 +7,8 @@ import pickle
 import re
 import subprocess
 import sys
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from registered import FILE
 
 import halfspace_sss
 from halfspace_sss import Medium
-from halfspace_sss.materials import Material, load, names, table
+from halfspace_sss.materials import Material, files, load, names, table
 from halfspace_sss.materials import catalogue as registry
 
 
@@ -236,3 +238,28 @@ def test_importing_the_registry_is_light():
     heavy = "torch mitsuba drjit matplotlib pandas pydantic scipy"
     code = f"import sys, halfspace_sss.materials; print([m for m in '{heavy}'.split() if m in sys.modules])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"
+
+
+def test_written_materials_are_read_as_equal_ones(tmp_path: Path) -> None:
+    for name in names():
+        material = load(name)
+        registry.write(tmp_path / "one.toml", material)
+        assert files.read(tmp_path / "one.toml") == [material], name
+    pair = [replace(material, name=f"{material.name} {k}", note='a "note" \\ of two') for k in range(2)]
+    registry.write(tmp_path / "two.toml", *pair)
+    assert files.read(tmp_path / "two.toml") == pair
+
+
+@pytest.mark.parametrize(
+    ("path", "change", "message"),
+    [
+        ("a.json", {}, r"path must end in .toml, got '.*a.json'"),
+        ("a.toml", {"dilution": 0.5}, "dilution of 'b' must be 1 in a file, got 0.5"),
+        ("a.toml", {"set": "other"}, "set of 'b' must be that of 'marble', 'Jensen2001', got 'other'"),
+    ],
+)
+def test_materials_that_no_file_holds_are_not_written(tmp_path: Path, path: str, change: dict, message: str) -> None:
+    marble = load("marble")
+    with pytest.raises(ValueError, match=message):
+        registry.write(tmp_path / path, marble, replace(marble, name="b", **change))
+    assert not list(tmp_path.iterdir())

@@ -130,3 +130,11 @@ def test_wavelengths_that_the_spectra_do_not_cover_are_refused() -> None:
         skin_like().to_rgb([500, 600])
     with pytest.raises(ValueError, match=r"sigma_s must have 2 values.*\(3,\)"):
         SpectralMedium([500, 600], [1, 2, 3], 0.1, 0.0, 1.3)
+
+
+def test_spectra_come_back_from_a_csv_file_with_all_digits(tmp_path: Path) -> None:
+    written = SpectralMedium([400.0, 550.5, 700.0], [2 / 3, 1.0, 0.1], [0.0, 1e-7, 3.0], 0.85, 1.37, "a lab")
+    written.to_csv(tmp_path / "a.csv")
+    read = read_spectra(tmp_path / "a.csv", "1/mm")
+    for name in ("wavelengths", "sigma_s", "sigma_a", "g", "n"):
+        assert np.array_equal(getattr(read, name), getattr(written, name)), name

@@ -261,3 +261,16 @@ def test_light_that_is_hardly_turned_is_found_however_far_it_goes():
     media = (Medium(1.0, 0.0, 1 - e) for e in (1e-5, 1e-12))
     R = [measure.reflectance(bssrdf("better_dipole", medium), 0.5) for medium in media]
     np.testing.assert_allclose(R[1], R[0], rtol=2e-5)
+
+
+def test_ring_means_are_those_of_the_profile_and_add_up_to_the_reflectance() -> None:
+    model = bssrdf("better_dipole", Medium([1.0, 2.0], [0.2, 0.1], 0.3, 1.4))
+    edges = np.array([0.0, 0.5, 1.0, 4.0, 60.0])
+    rings = measure.ring_means(model, edges, 0.7)
+    r = np.linspace(0.5, 1.0, 2001)
+    M = measure.profile(model, r, 0.7) * r[:, None]
+    assert np.allclose(rings[1], ((M[1:] + M[:-1]) / 2).sum(axis=0) * (r[1] - r[0]) * 2 / (1 - 0.25), rtol=1e-5)
+    whole = (rings * np.pi * np.diff(edges**2)[:, None]).sum(axis=0)
+    assert np.allclose(whole, measure.reflectance(model, 0.7), rtol=1e-3)
+    with pytest.raises(ValueError, match="radii must be two or more"):
+        measure.ring_means(model, [1.0])
