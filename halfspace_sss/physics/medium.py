@@ -364,7 +364,7 @@ class HasMedium(Protocol):
 
 
 def medium_of(given: Medium | HasMedium) -> Medium:
-    """The medium of a material; anything else as it is, but for names, of which `materials` has the list.
+    """The medium of a material; anything else as it is, but for names, which `materials.load` takes.
 
     Raises:
         ValueError: it is a name.

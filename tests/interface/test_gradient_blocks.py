@@ -89,6 +89,18 @@ def test_transforms_of_functions_and_forward_derivatives_are_answered_at_once(mo
     np.testing.assert_allclose(tangent.detach(), expected, rtol=1e-12)
 
 
+def test_vmap_maps_values_and_derivatives_of_every_model(name):
+    model = halfspace_sss.bssrdf(name, MEDIUM)
+    r = torch.linspace(0.1, 3, 5, dtype=torch.float64)
+
+    def S(r):
+        return model.eval(r, 0.8, 0.2, 0.7, 0.4).sum()
+
+    torch.testing.assert_close(torch.func.vmap(S)(r), torch.stack([S(v) for v in r]))
+    slopes = torch.stack([torch.func.grad(S)(v) for v in r])
+    torch.testing.assert_close(torch.func.vmap(torch.func.grad(S))(r), slopes)
+
+
 def test_what_depends_on_further_tensors_keeps_their_derivatives(monkeypatch):
     monkeypatch.setattr(gradient_blocks, "BLOCK_BYTES", 1)
     strength = torch.tensor(2.0, requires_grad=True)
