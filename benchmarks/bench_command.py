@@ -26,23 +26,17 @@ class BenchPart(str, Enum):
     learnt = "learnt"
     edits = "edits"
     first = "first"
+    guided = "guided"
 
 
 PARTS = tuple(part.value for part in BenchPart)
-# measured where no part is asked for; a learnt object, which takes minutes, is asked for
-OF_BACKEND = {"llvm": PARTS[:4], "cuda": tuple(part for part in PARTS[4:] if part != "learnt")}
+OF_GPU = ("trace", "renders", "learnt", "edits", "first")  # parts that a GPU has
+OF_BACKEND = {"llvm": PARTS[:4], "cuda": ("trace", "renders", "edits", "first")}  # where no part is asked for
 # about, for a row; only the time left depends on it
 SECONDS = {
-    "walk": 1,
-    "volpath": 15,
-    "models": 3,
-    "maps": 100,
-    "trace": 2,
-    "renders": 12,
-    "learnt": 60,
-    "edits": 10,
-    "first": 30,
-}
+    "walk": 1, "volpath": 15, "models": 3, "maps": 100,
+    "trace": 2, "renders": 12, "learnt": 60, "edits": 10, "first": 30, "guided": 1,
+}  # fmt: skip
 SIZES = {"llvm": 256, "cuda": 1024}  # pixels of square images; those of `renders` are half as wide
 EVENTS = {"llvm": 2**27, "cuda": 2**34}  # of a trace
 TITLES = {
@@ -54,6 +48,7 @@ TITLES = {
     "renders": "variance x time of volpathmis over that of a way, summed over the pixels of the object",
     "learnt": "the same of a learnt object, light sampled",
     "edits": "seconds of the first image of a scene, and after an edit, 1 sample a pixel",
+    "guided": "variance x time of plain walks in the half-space over that of walks guided towards the surface",
     "first": "seconds of a new process to its first image, with no kernel known and with all",
 }
 COLUMNS = {  # key of a row -> heading and format
@@ -66,6 +61,7 @@ COLUMNS = {  # key of a row -> heading and format
     "weight_variance": ("variance of\nsample weight", "{:.2f}"),
     "numpy": ("NumPy", "{:.1e}"), "torch": ("torch", "{:.1e}"), "drjit": ("Dr.Jit", "{:.1e}"), "maps": ("maps", "{}"),
     "object": ("object", "{}"), "light": ("light", "{}"), "way": ("way", "{}"), "pixels": ("pixels", "{}"),
+    "guided": ("guided\nflights", "{:g}"), "over_plain": ("plain walks\nover it", "{:.2f}"),
     "ns": ("ns a sample", "{:.1f}"), "cells_s": ("cells, s", "{:.2f}"),
     "over_volpathmis": ("volpathmis\nover it", "{:.2f}"), "ready_s": ("ready", "{:.2f}"),
     "light_s": ("light turned", "{:.3f}"), "camera_s": ("camera moved", "{:.3f}"),
@@ -81,9 +77,9 @@ def chosen_parts(asked: Sequence[str] | None, backend: str = "llvm") -> list[str
         ValueError: a part is of the CPU alone, and the backend is not.
     """
     asked = asked or OF_BACKEND[backend]
-    of_cpu = [part for part in asked if part in PARTS[:4]]
+    of_cpu = [part for part in asked if part not in OF_GPU]
     if backend == "cuda" and of_cpu:
-        raise ValueError(f"only must be one of {', '.join(PARTS[4:])} with --backend cuda, got {of_cpu[0]!r}")
+        raise ValueError(f"only must be one of {', '.join(OF_GPU)} with --backend cuda, got {of_cpu[0]!r}")
     return [part for part in PARTS if part in asked or (part == "walk" and "volpath" in asked)]
 
 
@@ -153,7 +149,7 @@ def _lengths(quick: bool) -> dict[str, int]:
     from halfspace_sss import models
 
     media, depths, maps = (1 if quick else len(each) for each in (MEDIA, ROULETTE_DEPTHS, MAP_MEDIA))
-    renders = {"trace": media, "renders": 9, "learnt": 9, "edits": 2, "first": 4}
+    renders = {"trace": media, "renders": 9, "learnt": 9, "edits": 2, "first": 4, "guided": 8 if quick else 32}
     return {"walk": 2 * media, "volpath": media * depths, "models": len(models()), "maps": maps, **renders}
 
 
@@ -169,6 +165,10 @@ def _rows(part: str, backend: str, quick: bool, tables: dict[str, list[dict]]) -
         return bench.bench_models(n=1024, least_seconds=0.01) if quick else bench.bench_models()
     if part == "trace":
         return bench.bench_traces(backend, 2**16 if quick else EVENTS[backend], bench.MEDIA[: 1 if quick else None])
+    if part == "guided":
+        from benchmarks.guided_walks import ALBEDOS, bench_guided
+
+        return bench_guided(1024, 4, ALBEDOS[:1]) if quick else bench_guided()
     if part != "maps":
         from benchmarks import bench_renders
 

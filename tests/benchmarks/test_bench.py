@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 import halfspace_sss
 from benchmarks import __main__ as cli
 from benchmarks import bench_command as cli_bench
+from halfspace_sss import Medium
 
 pytestmark = pytest.mark.slow
 
@@ -83,9 +84,16 @@ def test_without_mitsuba_volpath_is_left_out_with_a_sentence(tmp_path: Path, mon
 
 
 def test_a_gpu_has_parts_of_its_own_and_refuses_those_of_the_cpu() -> None:
-    assert cli_bench.chosen_parts(None, "cuda") == ["trace", "renders", "edits", "first"]
+    assert cli_bench.chosen_parts(None, "cuda") == list(cli_bench.OF_BACKEND["cuda"])
     with pytest.raises(ValueError, match="only must be one of trace, .* with --backend cuda, got 'maps'"):
         cli_bench.chosen_parts(["trace", "maps"], "cuda")
+
+
+def test_guided_walks_have_the_reflectance_of_plain_ones(tmp_path: Path) -> None:
+    assert _invoke("--quick", "--only", "guided", "--out", str(tmp_path)).exit_code == 0
+    for row in _rows(tmp_path / "bench_guided.csv"):
+        R = Medium.from_albedo(float(row["albedo"]), 1.0, 0.0, float(row["eta"])).reflectance(1.0)
+        assert abs(float(row["mean"]) - R) <= 4 * float(row["standard_error"]) < 0.1 * R
 
 
 @pytest.mark.slow
