@@ -277,3 +277,19 @@ def broadcast_query(*args: Real, names: Sequence[str] = ()) -> tuple[Library, tu
         return lib, tuple(np.broadcast_arrays(*args) if lib is _NUMPY else lib.torch.broadcast_tensors(*args))
     except (ValueError, RuntimeError) as error:
         raise ValueError(f"query shapes do not broadcast: {error}") from error
+
+
+def aligned(kind: type, values: np.ndarray) -> Lanes:
+    """Numbers of any shape as one array of Dr.Jit, 32 bits each, at an address that is a multiple of 64.
+
+    Dr.Jit takes over the memory of NumPy, and whether its address is one is in the code of kernels: where chance
+    decides, they are compiled twice for each such array.
+    """
+    import drjit as dr
+
+    dtype = {dr.VarType.UInt32: np.uint32, dr.VarType.Int32: np.int32}.get(dr.type_v(kind), np.float32)
+    size = np.size(values)
+    room = np.empty(size + 16, dtype)
+    first = (-room.ctypes.data % 64) // 4
+    room[first : first + size] = np.ravel(values)
+    return kind(room[first : first + size])

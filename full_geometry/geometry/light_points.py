@@ -26,10 +26,12 @@ from full_geometry.geometry.points import (
     SurfacePoint,
     area_points,
     cosine_above,
+    floats,
     lifted,
     opaque,
 )
 from full_geometry.geometry.shape import Geometry
+from halfspace_sss.arrays import aligned
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -83,7 +85,7 @@ class SurfacePoints:
     def of(cls, geometry: Geometry, count: int) -> SurfacePoints:
         """`count` points of an object."""
         # a low-discrepancy set over the area, then points where random places have none in reach
-        u = [mi.Float(v.astype(np.float32)) for v in lattice(count)]
+        u = [floats(v) for v in lattice(count)]
         p, n, n_out, _, face, _ = uniform_entries(geometry, u[0], mi.Point2f(u[1], u[2]))
         dr.eval(p, n, n_out, face)
         h = REACH * float(np.sqrt(geometry.area / count))
@@ -97,7 +99,7 @@ class SurfacePoints:
     def _without_gaps(self, geometry: Geometry, seed: int) -> SurfacePoints:
         """With points where random places have none in reach: faces in rows can be in step with the set."""
         u = np.random.default_rng(seed).random((3, PLACES)).astype(np.float32)
-        at = uniform_entries(geometry, mi.Float(u[0]), mi.Point2f(u[1:]))
+        at = uniform_entries(geometry, floats(u[0]), mi.Point2f(floats(u[1]), floats(u[2])))
         missed = np.flatnonzero(~np.array(self.nearest(at.p, at.n, mi.Bool(True))[1]))
         if not len(missed):
             return self
@@ -226,4 +228,4 @@ def _grid(p: np.ndarray, h: float) -> tuple[float, np.ndarray, np.ndarray, mi.UI
     place, point = np.concatenate(place), np.concatenate(point)
     order = np.argsort(place, kind="stable")
     first = np.searchsorted(place[order], np.arange(cells.prod() + 1))
-    return h, low, cells, mi.UInt32(first.astype(np.uint32)), mi.UInt32(point[order].astype(np.uint32))
+    return h, low, cells, aligned(mi.UInt32, first), aligned(mi.UInt32, point[order])

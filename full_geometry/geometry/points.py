@@ -29,6 +29,7 @@ import numpy as np
 from full_geometry.geometry import mesh
 from full_geometry.geometry.rounding import ray_from
 from full_geometry.geometry.shape import Geometry
+from halfspace_sss.arrays import aligned
 
 if TYPE_CHECKING:
     from halfspace_sss.interface.model import BSSRDF
@@ -139,16 +140,8 @@ def opaque(value: float) -> mi.Float:
 
 
 def floats(values: np.ndarray) -> mi.Float:
-    """Numbers of any shape in single precision, in one row, at an address that is a multiple of 64.
-
-    Dr.Jit takes over the memory of NumPy, and whether its address is one is in the code of kernels: where chance
-    decides, they are compiled twice for each such array.
-    """
-    size = np.size(values)
-    room = np.empty(size + 16, np.float32)
-    first = (-room.ctypes.data % 64) // 4
-    room[first : first + size] = np.ravel(values)
-    return mi.Float(room[first : first + size])
+    """`aligned` numbers in single precision."""
+    return aligned(mi.Float, values)
 
 
 def of_rows(kind: type, rows: np.ndarray) -> mi.Vector3f | mi.Spectrum:
@@ -643,14 +636,14 @@ class AreaPoints:
         if mesh.has_faces(shape):
             a, b, c = mesh.face_corners(shape, np.float32)
             self.areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
-            self.faces = mi.DiscreteDistribution(mi.Float(self.areas.astype(np.float32)))
+            self.faces = mi.DiscreteDistribution(floats(self.areas))
 
     def lit(self, brightness: np.ndarray) -> AreaPoints:
         """Points of a mesh by the brightness of its faces, positive numbers."""
         result = copy(self)
         brightness = brightness * (self.areas.sum() / (self.areas * brightness).sum())
-        result.light = mi.Float(brightness.astype(np.float32))
-        result.faces = mi.DiscreteDistribution(mi.Float((self.areas * brightness).astype(np.float32)))
+        result.light = floats(brightness)
+        result.faces = mi.DiscreteDistribution(floats(self.areas * brightness))
         return result
 
     def brightness(self, face: mi.UInt32) -> mi.Float | float:
@@ -731,7 +724,7 @@ class RadialTable:
     def _arrays(self) -> tuple[mi.Float, ...]:
         if mi.variant() not in self._lanes:
             numbers = (opaque(v) for v in (self.r_min, self.per_log, self.reach))
-            self._lanes[mi.variant()] = (*(mi.Float(v.astype(np.float32)) for v in self._numpy), *numbers)
+            self._lanes[mi.variant()] = (*(floats(v) for v in self._numpy), *numbers)
             dr.eval(self._lanes[mi.variant()])
         return self._lanes[mi.variant()]
 

@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from full_geometry.geometry import mesh
 from full_geometry.geometry.rounding import bound_of, ray_from
 from full_geometry.geometry.snapshot import Snapshot
+from halfspace_sss.arrays import aligned
 
 MOST_COPIES = 1e-3  # share of the area in faces that exist twice, by which light may then be wrong
 CREASES = 0.01  # of the corners whose vertex normal may be on the other side of the face, as at sharp edges
@@ -363,8 +364,8 @@ class _Votes:
         n = 0 if faces is None else int(faces.pieces.max()) + 1
         mixed = faces is not None and faces.sides is not None
         n = n if n > 1 or mixed else 0
-        self.pieces = mi.UInt32(faces.pieces.astype(np.uint32)) if n else None
-        self.sides = mi.Float(faces.sides.astype(np.float32)) if mixed else None
+        self.pieces = aligned(mi.UInt32, faces.pieces) if n else None
+        self.sides = aligned(mi.Float, faces.sides) if mixed else None
         self.hits, self.outward = dr.zeros(mi.Float, n), dr.zeros(mi.Float, n)
         self.opposed = dr.zeros(mi.Float, 1)
 
@@ -398,7 +399,7 @@ class _Votes:
             return None
         sign = np.where(self._shares() < 0.5, -1.0, 1.0)[np.array(self.pieces)]
         sign = sign if self.sides is None else sign * np.array(self.sides)
-        return mi.Float(sign.astype(np.float32)) if np.ptp(sign) > 0 else None
+        return aligned(mi.Float, sign) if np.ptp(sign) > 0 else None
 
 
 def _outside_view(scene: mi.Scene, votes: _Votes) -> tuple[np.ndarray, float]:

@@ -26,7 +26,7 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.geometry.light_points import lattice, uniform_entries
-from full_geometry.geometry.points import place, turned
+from full_geometry.geometry.points import floats, place, turned
 from full_geometry.geometry.rounding import blocked
 from full_geometry.precomputed.transport_matrix import Incident, TransportMatrix, bent, cosine
 
@@ -92,7 +92,7 @@ def fine_light(
     if not emitters:
         return None
     n, count = COUNT, len(T.points)
-    u = [mi.Float(v.astype(np.float32)) for v in lattice(n)]
+    u = [floats(v) for v in lattice(n)]
     places = uniform_entries(obj.geometry, u[0], mi.Point2f(u[1], u[2]))
     near = np.array(T.points.nearest(places.p, places.n, mi.Bool(True))[0])
     area = obj.geometry.area / n * np.maximum(np.bincount(near, minlength=count), 0.5)
@@ -150,7 +150,7 @@ def _arriving(view: tuple, at: tuple, emitter: mi.Emitter) -> tuple[np.ndarray, 
 def _by_rays(view: tuple, emitter: mi.Emitter) -> _Light:
     """The light at places that rays of an emitter meet."""
     scene, instance_scene, obj, T = view
-    u = [mi.Float(v.astype(np.float32)) for v in lattice(COUNT, roots=ROOTS, shift=[0.5] * 4)]
+    u = [floats(v) for v in lattice(COUNT, roots=ROOTS, shift=[0.5] * 4)]
     ray, flux = emitter.sample_ray(0.0, 0.5, mi.Point2f(u[0], u[1]), mi.Point2f(u[2], u[3]), True)
     si = instance_scene.intersect(scene, ray, mi.RayFlags.All, False, True)
     on = si.is_valid() & (si.shape == mi.ShapePtr(obj.geometry.shape))

@@ -36,6 +36,7 @@ from full_geometry.transport.features import n_local, n_pair, n_side
 from full_geometry.transport.one_object import FullGeometry
 from full_geometry.transport.patches import Patches, PatchSampler, cluster
 from full_geometry.transport.storing import frame_of, identify
+from halfspace_sss.arrays import aligned
 from halfspace_sss.backend import clock
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.neural.store import check_weights_folder, to_json
@@ -182,7 +183,7 @@ def _points(part: FirstExits) -> tuple[SurfacePoint, WalkExits]:
 
 
 def _lanes(numbers: np.ndarray) -> mi.UInt32:
-    return mi.UInt32(numbers.astype(np.uint32))
+    return aligned(mi.UInt32, numbers)
 
 
 VALIDATIONS = 4  # in a run

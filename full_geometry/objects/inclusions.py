@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.geometry.instances import InstanceTable, corners, ends_of, shapes_of, shown_groups
+from full_geometry.geometry.points import floats
 from full_geometry.geometry.shape import Geometry, is_inside, meet_alone, name_of, scene_of, ways_into
 from full_geometry.surface.sheets import is_sheet
 from full_geometry.surface.wrapped import surface_of
@@ -271,7 +272,7 @@ def _shares(shape: mi.Shape, other: mi.Scene, into: np.ndarray, close: np.ndarra
     n /= np.linalg.norm(n, axis=1, keepdims=True)
     o, d = (np.moveaxis(v, 0, 1).reshape(3, -1) for v in (p - n * close[:, None, None], n))
     ray = mi.Ray3f(mi.Point3f(o), mi.Vector3f(d))
-    ray.maxt = mi.Float(np.repeat(2 * close, p.shape[2]))
+    ray.maxt = floats(np.repeat(2 * close, p.shape[2]))
     si = other.ray_intersect(ray, mi.RayFlags.Minimal, False)
     on = np.array(si.is_valid() & (dr.abs(dr.dot(si.n, ray.d)) > 0.99))
     return on.reshape(len(into), -1).sum(axis=1) > max(MOST_TOUCHING, SHARE_TOUCHING * looks)

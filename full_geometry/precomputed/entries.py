@@ -18,7 +18,8 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.geometry.light_points import GOLDEN, REACH, SurfacePoints, lattice, uniform_entries
-from full_geometry.geometry.points import EntrySample, PositionSampler, evaluate, opaque
+from full_geometry.geometry.points import EntrySample, PositionSampler, evaluate, floats, opaque
+from halfspace_sss.arrays import aligned
 
 PLACES = 2**17
 ROOTS = 2**0.5, 3**0.5, 5**0.5  # of their lattice: by that of the points they would be in step with all of these
@@ -117,7 +118,7 @@ def _places(
     positions: PositionSampler, points: SurfacePoints, rank: np.ndarray, rng: np.random.Generator
 ) -> tuple[EntrySample, mi.UInt32]:
     """Uniform places in the order of their points, of that rank, and those."""
-    u = [mi.Float(np.minimum(v, 1 - 2**-24).astype(np.float32)) for v in lattice(PLACES, ROOTS, rng.random(3))]
+    u = [floats(np.minimum(v, 1 - 2**-24)) for v in lattice(PLACES, ROOTS, rng.random(3))]
 
     # uniform places, and the point that each belongs to
     at = uniform_entries(positions.geometry, u[0], mi.Point2f(u[1], u[2]))
@@ -126,9 +127,9 @@ def _places(
     # those that a point is in reach of, point by point
     kept = np.flatnonzero(known)
     kept = kept[np.argsort(rank[point[kept]], kind="stable")]
-    places = at.gather(mi.UInt32(kept.astype(np.uint32)))
+    places = at.gather(aligned(mi.UInt32, kept))
     evaluate(places)
-    return places, mi.UInt32(point[kept])
+    return places, aligned(mi.UInt32, point[kept])
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,11 +178,11 @@ class _Tree:
 
         def packed(x: np.ndarray, within: np.ndarray | float) -> mi.Float:
             fourth = np.broadcast_to(within, len(x))
-            return mi.Float(np.column_stack([x, fourth]).astype(np.float32).ravel())
+            return floats(np.column_stack([x, fourth]))
 
         return cls(
             positions,
-            mi.UInt32(np.column_stack([group, point, *ends]).astype(np.uint32).ravel()),
+            aligned(mi.UInt32, np.column_stack([group, point, *ends])),
             packed(middle, (FAR * radius) ** 2),
             packed(p, (NEAR * points.h / REACH) ** 2),
             packed(np.array(places.p).T, 0.0),

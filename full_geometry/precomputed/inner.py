@@ -22,8 +22,9 @@ import numpy as np
 from scipy.sparse import csc_array, csr_array
 
 from full_geometry.geometry.light_points import lattice, uniform_entries
-from full_geometry.geometry.points import cosine_above, opaque, place, refract_in, surface_point
+from full_geometry.geometry.points import cosine_above, floats, opaque, place, refract_in, surface_point
 from full_geometry.geometry.rounding import ray_from
+from halfspace_sss.arrays import aligned
 
 if TYPE_CHECKING:
     from full_geometry.objects.objects import TranslucentObject
@@ -90,7 +91,7 @@ class Events:
         counts = np.floor((x.max(axis=0) - low) / h).astype(int) + 2
         cell = np.floor((x - low) / h).astype(int)
         order = np.argsort((cell[:, 2] * counts[1] + cell[:, 1]) * counts[0] + cell[:, 0], kind="stable")
-        lanes = mi.UInt32(order.astype(np.uint32))
+        lanes = aligned(mi.UInt32, order)
         p, n = dr.gather(mi.Point3f, p, lanes), dr.gather(mi.Normal3f, n, lanes)
         dr.eval(p, n)
 
@@ -100,7 +101,7 @@ class Events:
         kept = np.flatnonzero(weights.sum(axis=1) >= LEAST)
         index = np.full(counts.prod(), -1, dtype=np.int32)
         index[kept] = np.arange(len(kept))
-        return cls(p, n, low, h, counts, mi.Int32(index), weights[kept])
+        return cls(p, n, low, h, counts, aligned(mi.Int32, index), weights[kept])
 
     @cached_property
     def _planes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -140,7 +141,7 @@ def _places(obj: TranslucentObject, count: int) -> tuple[mi.Point3f, mi.Normal3f
     k = dr.arange(mi.UInt32, count)
     u = lattice(count)
     order = np.argsort(u[0])  # by faces: rays of neighbours meet the same part of the surface
-    u = [mi.Float(v[order].astype(np.float32)) for v in u]
+    u = [floats(v[order]) for v in u]
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(11, count)
 
@@ -195,7 +196,7 @@ class InnerLight:
         """Inner light from ∫ Y_lm(w) L dw at events, (events, bands, channels)."""
         planes = events.fitted(values.reshape(len(values), -1))
         g = tuple(float(m.g) for m in obj.media)
-        return cls(events, mi.Float(planes.astype(np.float32).ravel()), bands(obj), g)
+        return cls(events, floats(planes), bands(obj), g)
 
     def __call__(self, p: mi.Point3f, d: mi.Vector3f, active: mi.Bool) -> mi.Spectrum:
         """J(p, d), 0 where no event was near."""

@@ -23,8 +23,9 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import distance_transform_cdt, label
 
-from full_geometry.geometry.points import EntrySample, opaque
+from full_geometry.geometry.points import EntrySample, floats, of_rows, opaque
 from full_geometry.walk.media import WalkMedia
+from halfspace_sss.arrays import aligned
 
 BRICK = 4  # cells along its edge: its 64 cells are the bits of a number
 MOST_BRICKS, MOST_SLOTS = 2**24, 5 * 2**18  # of one object: h grows until it has no more
@@ -146,9 +147,9 @@ class InsideCells:
         index, slot, slots = _numbered(held, fine, coarse, len(surface))
         place, offset = _parents(cells, moments[:, 0, 0], BRICK * counts)
         return cls(
-            low=low, h=h, counts=counts, index=index, slots=slots, cut=mi.UInt32(slot[at[row], bit]),
-            place=mi.UInt32(place), offset=mi.Vector3f(offset.T),
-            solve=mi.Float(_solutions(moments, place, offset).ravel()),
+            low=low, h=h, counts=counts, index=index, slots=slots, cut=aligned(mi.UInt32, slot[at[row], bit]),
+            place=aligned(mi.UInt32, place), offset=of_rows(mi.Vector3f, offset),
+            solve=floats(_solutions(moments, place, offset)),
         )  # fmt: skip
 
     def share(self, sums: mi.Float, n: int, moments: bool = False) -> None:
@@ -305,7 +306,7 @@ def _numbered(held: np.ndarray, fine: np.ndarray, coarse: np.ndarray, bricks: in
     brick[coarse] = 2 * (slot.size + last * np.arange(len(coarse))) + 1
     slots = n + last * len(coarse)
     cells = np.concatenate([slot.ravel(), np.arange(n, slots, dtype=np.int32)])
-    return CellIndex(mi.Int32(brick), mi.Int32(cells)), slot, slots
+    return CellIndex(aligned(mi.Int32, brick), aligned(mi.Int32, cells)), slot, slots
 
 
 def _solutions(moments: np.ndarray, place: np.ndarray, offset: np.ndarray) -> np.ndarray:
@@ -364,7 +365,7 @@ def _crossed_cells(
     """
     place = np.full(int(counts.prod()), -1, dtype=np.int32)
     place[bricks] = np.arange(len(bricks))
-    place, best = mi.Int32(place), dr.zeros(mi.UInt32, BRICK**3 * len(bricks))
+    place, best = aligned(mi.Int32, place), dr.zeros(mi.UInt32, BRICK**3 * len(bricks))
     for part in points(POINTS[1] / h**2):
         n = dr.abs(part.n)
         axis = dr.select(n.x >= dr.maximum(n.y, n.z), mi.UInt32(0), dr.select(n.y >= n.z, mi.UInt32(1), 2))
@@ -399,7 +400,7 @@ def _cells_of(bricks: np.ndarray, cell: np.ndarray, counts: np.ndarray) -> np.nd
 
 def _points(x: np.ndarray, low: np.ndarray, h: float) -> mi.Point3f:
     """Points at places of the grid, (n, 3) in units of h."""
-    return mi.Point3f((low + h * x).T.astype(np.float32))
+    return of_rows(mi.Point3f, low + h * x)
 
 
 def _own_hit(media: WalkMedia, k: mi.Int32, ray: mi.Ray3f) -> tuple[mi.Float, mi.Bool, mi.Bool]:
@@ -449,11 +450,11 @@ def _measure(
     """
     n = len(axes)
     across_cell = COLUMNS[n >= FINE]
-    number, edge, axis = dr.full(mi.Int32, k, n), opaque(h), mi.UInt32(axes.astype(np.uint32))
+    number, edge, axis = dr.full(mi.Int32, k, n), opaque(h), aligned(mi.UInt32, axes)
     centre = _points(cells + 0.5, low, h)
     d = mi.Vector3f(*(dr.select(axis == a, mi.Float(1), 0) for a in range(3)))
     # by the place of a cell, not by its number: rounding may add cells, and all others keep their columns
-    place = mi.Vector3u(cells.T.astype(np.uint32))
+    place = mi.Vector3u(*(aligned(mi.UInt32, axis) for axis in cells.T))
     rng = mi.PCG32(initstate=mi.UInt64(place.x) + (mi.UInt64(place.y) << 20) + (mi.UInt64(place.z) << 40), initseq=k)
     total, side = (dr.opaque(mi.UInt32, v) for v in (across_cell**2, across_cell))
 

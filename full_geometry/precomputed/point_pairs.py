@@ -15,6 +15,7 @@ import numpy as np
 
 from full_geometry.geometry.light_points import GOLDEN
 from full_geometry.geometry.points import EntrySample, SurfacePoint, of_rows
+from halfspace_sss.arrays import aligned
 
 if TYPE_CHECKING:
     from full_geometry.objects.objects import TranslucentObject
@@ -112,7 +113,7 @@ class EntryPairs(NamedTuple):
         # the exit along w_o, the entry with light along w
         obj, on = self.object, mi.Bool(True)
         w_o = self.w_o[lit.row, lit.number % self.w_o.shape[1]]
-        row, number = mi.UInt32(lit.row), mi.UInt32(lit.number)
+        row, number = aligned(mi.UInt32, lit.row), aligned(mi.UInt32, lit.number)
         w_o, w = (of_rows(mi.Vector3f, v) for v in (w_o, lit.w))
         entry = self.entries(number)
         at, prepared = entry.facing(w), obj.transport.prepare(self.out(row, w_o)[0], on)

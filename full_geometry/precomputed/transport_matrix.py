@@ -54,12 +54,14 @@ from full_geometry.geometry.points import (
     channel_mean,
     cosine_above,
     evaluate,
+    floats,
     of_rows,
     opaque,
     wrapped,
 )
 from full_geometry.precomputed.entries import PLACES, StratifiedEntries
 from full_geometry.precomputed.point_pairs import EntryPairs, Rays, lit_pairs
+from halfspace_sss.arrays import aligned
 from halfspace_sss.interrupts import checkpoint
 from halfspace_sss.physics.fresnel import F_t
 
@@ -545,7 +547,7 @@ class RowUniforms:
         return [self._lattice(order * r % 1.0) for r in R_2]
 
     def _lattice(self, u: np.ndarray) -> Lattice:
-        return Lattice(*(mi.Float(v.astype(np.float32)) for v in (u, self._rng.random(self._rows))))
+        return Lattice(*map(floats, (u, self._rng.random(self._rows))))
 
 
 class Lattice(NamedTuple):
@@ -756,7 +758,7 @@ def _rows(
         return np.zeros(even.shape[1], dtype=bool), even
 
     # Σ S / Σ alpha, smoothed more, as alpha has the detail
-    j = mi.UInt32(np.repeat(np.arange(len(points), dtype=np.uint32), found.exits))
+    j = aligned(mi.UInt32, np.repeat(np.arange(len(points)), found.exits))
     out, face = points.exit_along(j, of_rows(mi.Vector3f, found.w_o[:, : found.exits].reshape(-1, 3)))
     alpha = np.array(obj.transport.alpha(obj.knowing(out, face), mi.Bool(True))[1], dtype=np.float32)
     known = found.S.mean(axis=1) / np.maximum(alpha.T.reshape(len(points), found.exits, -1).mean(axis=1), 1e-30)

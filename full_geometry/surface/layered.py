@@ -168,7 +168,7 @@ def depths_of(obj: Geometry, deepest: float) -> Depths:
     if not obj.closed:
         raise ValueError(f"object {obj.name} must be closed to have layers below its surface")
     # ---- points of the surface
-    u = [mi.Float(v.astype(np.float32)) for v in lattice(POINTS)]
+    u = [floats(v) for v in lattice(POINTS)]
     at = uniform_entries(obj, u[0], mi.Point2f(u[1], u[2]))
     p, n = (np.array(v, dtype=float).T for v in (at.p, at.n))
     e = float(np.sqrt(obj.area / POINTS))

@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.geometry.instances import InstanceScene, bounds_of
+from full_geometry.geometry.points import floats
 from full_geometry.geometry.rounding import ray_from
 from full_geometry.geometry.sensors import independent, seeded
 from full_geometry.integrators.bssrdf import is_bssrdf
@@ -343,7 +344,7 @@ def _look(
     rng = np.random.default_rng([*seed, 23])
     rows = rng.random((5, LAUNCH))
     rows[1:3] = (rows[1:3, :1] + np.arange(LAUNCH) * np.array(R_2)[:, None]) % 1
-    u = [mi.Float(row) for row in np.minimum(rows, 1 - 2**-24).astype(np.float32)]
+    u = [floats(row) for row in np.minimum(rows, 1 - 2**-24)]
     ray, _ = camera.sample_ray_differential(camera.shutter_open(), u[0], mi.Point2f(*u[1:3]), mi.Point2f(*u[3:]))
     si = scene.ray_intersect(mi.Ray3f(ray), mi.RayFlags.All, coherent=False)
     plain = si.is_valid() & ~(_shows_lamp(scene, shapes, si, False) | _shows_lamp(scene, shapes, si, True))

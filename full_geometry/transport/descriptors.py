@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.geometry.points import SurfacePoint, opaque, refract_in
+from full_geometry.geometry.points import SurfacePoint, floats, opaque, refract_in
 from full_geometry.objects.objects import TranslucentObject
 from full_geometry.transport.features import FirstEvent, first_event
 from halfspace_sss.neural.network import medium_features
@@ -207,7 +207,7 @@ def _from(
     obj: TranslucentObject, at: SurfacePoint, y: mi.Point3f, extinctions: tuple[float, float], active: mi.Bool
 ) -> RaySurroundings:
     """Surroundings of the points y below the points of a surface, for sigma_t and sigma_t'."""
-    tables = [mi.Float(row.astype(np.float32)) for row in directions()]
+    tables = [floats(row) for row in directions()]
     sigma_t, sigma_t_prime = extinctions
     decays = [opaque(v) for v in (sigma_t, *(sigma_t_prime / length for length in LENGTHS))]
     n, (t, b) = at.n_out, _tangents(at)

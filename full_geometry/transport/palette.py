@@ -44,6 +44,7 @@ from full_geometry.geometry.points import (
     PositionSampler,
     SurfacePoint,
     Transport,
+    floats,
     opaque,
     plane_query,
 )
@@ -280,7 +281,7 @@ class Palette:
     def _reflectances(self) -> mi.Float:
         """ln(R / albedo^p) of all nodes."""
         R = [measure.reflectance(m, SEEN) / float(m.medium.albedo) ** self.power for m in self.models]
-        return mi.Float(np.log(R).astype(np.float32))
+        return floats(np.log(R))
 
     def _numbers(self, c: int) -> tuple[float, ...]:
         row, g = self.rows[c], self.g[c]
@@ -393,7 +394,7 @@ class Palette:
     def _coefficients(self) -> mi.Float:
         """Of `MODES` functions of all nodes."""
         rows = np.concatenate([networks.coefficients for networks in self.networks.values()])
-        return mi.Float(rows.astype(np.float32).ravel())
+        return floats(rows)
 
 
 def _node(albedo: mi.Float, numbers: Sequence[mi.Float]) -> tuple[mi.UInt32, mi.Float]:

@@ -29,11 +29,13 @@ from full_geometry.geometry.points import (
     PositionSampler,
     SurfacePoint,
     cosine_direction,
+    floats,
     opaque,
     surface_point,
 )
 from full_geometry.objects.objects import TranslucentObject
 from full_geometry.transport.features import ObjectFrame, PreparedExit, Side, first_event, side_features
+from halfspace_sss.arrays import aligned
 from halfspace_sss.backend import one_blas_thread
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.tracing.walk import generator, pass_seed
@@ -107,10 +109,10 @@ class Patches:
         first = np.concatenate([[0.0], sums])[ends[:-1]]
         within = (sums - np.repeat(first, np.diff(ends))).astype(np.float32)
         self.tables = {
-            "patch": mi.UInt32(self.of_face), "face": mi.UInt32(order.astype(np.uint32)), "within": mi.Float(within),
-            "start": mi.UInt32(ends.astype(np.uint32)), "area": mi.Float(self.areas.astype(np.float32)),
-            "share": mi.Float((self.areas / self.areas.sum()).astype(np.float32)),
-            "upto": mi.Float(np.cumsum(self.areas / self.areas.sum()).astype(np.float32)),
+            "patch": aligned(mi.UInt32, self.of_face), "face": aligned(mi.UInt32, order), "within": floats(within),
+            "start": aligned(mi.UInt32, ends), "area": floats(self.areas),
+            "share": floats(self.areas / self.areas.sum()),
+            "upto": floats(np.cumsum(self.areas / self.areas.sum())),
         }  # fmt: skip
         dr.eval(self.tables)
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from halfspace_sss.arrays import library
+from halfspace_sss.arrays import aligned, library
 from halfspace_sss.executors import completed
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.maps.grid import draw_media
@@ -97,7 +97,7 @@ def evaluated(model: BSSRDF, query: tuple[np.ndarray, ...]) -> np.ndarray:
     if model.fast_in == "drjit":
         from drjit.llvm import Float
 
-        S = np.asarray(model.eval(*(Float(v.ravel()) for v in query)))
+        S = np.asarray(model.eval(*(aligned(Float, v) for v in query)))
     else:
         S = model.eval(*query)
     return np.asarray(S, np.float64).reshape(query[0].shape)

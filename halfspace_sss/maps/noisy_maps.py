@@ -16,7 +16,7 @@ from types import ModuleType
 
 import numpy as np
 
-from halfspace_sss.arrays import Lanes, library
+from halfspace_sss.arrays import Lanes, aligned, library
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count
 from halfspace_sss.executors import completed
@@ -146,7 +146,7 @@ def _group_tally(types: ModuleType, groups: Groups, grid: CellGrid, lanes_per_gr
     import drjit as dr
 
     def lanes(values: np.ndarray) -> Lanes:
-        return types.Float(np.repeat(values, lanes_per_group).astype(np.float32))
+        return aligned(types.Float, np.repeat(values, lanes_per_group))
 
     def phase(cosine: Lanes, event: Scatter, g: Lanes) -> Lanes:
         last, first = eval_hg(cosine, g), eval_hg(event.first, g)
@@ -173,10 +173,10 @@ def _launch(
     tally = _group_tally(types, groups, grid, per_group)
     constants = WalkConstants.per_lane(types, *(np.repeat(v, per_group) for v in (albedo, groups.g, groups.eta)))
     mu_in = np.maximum(np.sqrt(np.maximum(1 - (1 - groups.mu_i**2) / groups.eta**2, 0.0)), 1e-4)
-    start = types.Float(np.repeat(mu_in, per_group).astype(np.float32))
+    start = aligned(types.Float, np.repeat(mu_in, per_group))
     # order 1 is not recorded: walks start with weight albedo^-2 so that roulette spares them until order 2
     _, events = walk(
-        types, constants, start, walks, seed, [tally], weight=types.Float(np.repeat(albedo**-2, per_group))
+        types, constants, start, walks, seed, [tally], weight=aligned(types.Float, np.repeat(albedo**-2, per_group))
     )
     sums = tally.cells.result().reshape(len(groups), 2, GROUP, grid.n_u, grid.n_psi)
     sums *= (2 * albedo**2 / (walks * per_group))[:, None, None, None, None]

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from halfspace_sss.arrays import aligned
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_cosine, check_count, check_edges, rounding
 from halfspace_sss.interface.model import BSSRDF
@@ -257,7 +258,7 @@ def _evaluated(model: BSSRDF, query: Query) -> np.ndarray:
     query = np.broadcast_arrays(*query)
     if model.fast_in == "drjit":
         Float = array_types().Float
-        S = model.eval(*(Float(np.ravel(v).astype(np.float32)) for v in query)).numpy()
+        S = model.eval(*(aligned(Float, v) for v in query)).numpy()
     else:
         S = model.eval(*query)
     return np.asarray(S, dtype=np.float64).reshape(query[0].shape)

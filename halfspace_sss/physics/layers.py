@@ -33,9 +33,10 @@ class Layers:
     def __post_init__(self) -> None:
         if isinstance(self.media, Medium) or not isinstance(self.media, Sequence) or not self.media:
             raise ValueError(f"media must be a list of one medium or more, got {self.media!r}")
-        media = tuple(medium_of(medium) for medium in self.media)
-        for k, medium in enumerate(media, 1):
+        media = []
+        for k, given in enumerate(self.media, 1):
             try:
+                media.append(medium := medium_of(given))
                 check_scalar_medium(medium)
             except ValueError as error:
                 raise ValueError(f"layer {k}: {error}") from None
@@ -46,7 +47,7 @@ class Layers:
             raise ValueError(f"eta_below must be finite and > 0, got {self.eta_below!r}")
         if self.eta_below != 1 and len(thickness) < len(media):
             raise ValueError(f"eta_below must be left out below a semi-infinite layer, got {self.eta_below!r}")
-        object.__setattr__(self, "media", media)
+        object.__setattr__(self, "media", tuple(media))
         object.__setattr__(self, "thickness", thickness)
 
     def _checked_thickness(self, layers: int) -> tuple[float, ...]:

@@ -17,7 +17,7 @@ from types import ModuleType
 
 import numpy as np
 
-from halfspace_sss.arrays import Lanes
+from halfspace_sss.arrays import Lanes, aligned
 from halfspace_sss.checks import check_edges, check_finite, check_interval
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.tracing.passes import CellSums, Estimate, Pass, estimate, find_cell
@@ -146,7 +146,7 @@ class PathTally(Tally):
     """Flux by place and path length; cells (ring or elsewhere, length), lengths between edges or logarithmic."""
 
     def __init__(self, types: ModuleType, edges2: Lanes | None, lengths: np.ndarray | None) -> None:
-        self.edges2, self.lengths = edges2, None if lengths is None else types.Float(lengths)
+        self.edges2, self.lengths = edges2, None if lengths is None else aligned(types.Float, lengths)
         self.n = len(log_lengths()) + 1 if lengths is None else len(lengths) - 1
         self.cells = CellSums(types, _places(edges2) * self.n)
 
@@ -172,7 +172,7 @@ class DepthTally(Tally):
 
     def __init__(self, types: ModuleType, edges2: Lanes | None, depths: np.ndarray) -> None:
         self.Float = types.Float
-        self.edges2, self.depths, self.n = edges2, types.Float(depths), len(depths) - 1
+        self.edges2, self.depths, self.n = edges2, aligned(types.Float, depths), len(depths) - 1
         self.cells = CellSums(types, _places(edges2) * self.n)
 
     def start(self, lanes: int) -> tuple:
@@ -255,7 +255,7 @@ class Recorder:
     def tallies(self) -> list[Tally]:
         """New ones for a pass."""
         asked, types = self.instrument, self.types
-        edges2 = None if self.radii is None else types.Float((self.radii * self.sigma_t) ** 2)
+        edges2 = None if self.radii is None else aligned(types.Float, (self.radii * self.sigma_t) ** 2)
         self.named: dict[str, Tally] = {}
         if asked.times is not None:
             lengths = asked.times * (LIGHT_SPEED / self.medium.eta * self.sigma_t)

@@ -16,6 +16,7 @@ from types import ModuleType
 
 import numpy as np
 
+from halfspace_sss.arrays import aligned
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import as_count, check_choice, check_cosine, check_count, check_interval
 from halfspace_sss.physics.fresnel import F_r, mu_internal
@@ -164,7 +165,7 @@ class _Tally:
         self.rings = None
         if edges is not None:
             self.n_rings = len(edges) - 1
-            self.edges2 = types.Float(np.asarray(edges, dtype=np.float64) ** 2)
+            self.edges2 = aligned(types.Float, np.asarray(edges, dtype=np.float64) ** 2)
             self.rings = CellSums(types, 3 * (self.n + 1) * self.n_rings)
 
     def event(self, event: Boundary, crosses, transmitted, deepest, layer, absorbed) -> None:
@@ -188,7 +189,7 @@ class _Constants:
         import drjit as dr
 
         def table(values: list[float]):
-            return types.Float(np.asarray(values, dtype=np.float64).astype(np.float32))
+            return aligned(types.Float, values)
 
         media, eta = layers.media, [m.eta for m in layers.media]
         self.inverse_sigma_t = table([m.mfp for m in media])

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from halfspace_sss.arrays import Lanes
+from halfspace_sss.arrays import Lanes, aligned
 from halfspace_sss.checks import check_choice, check_edges
 from halfspace_sss.physics.fresnel import F_t, mu_internal
 from halfspace_sss.physics.layers import Layers
@@ -133,7 +133,7 @@ class RingTally(Tally):
 
     def __init__(self, types: ModuleType, edges: np.ndarray) -> None:
         self.n = len(edges) - 1
-        self.edges2 = types.Float(np.asarray(edges, dtype=np.float64) ** 2)
+        self.edges2 = aligned(types.Float, np.asarray(edges, dtype=np.float64) ** 2)
         self.cells = CellSums(types, 2 * self.n)
 
     def boundary(self, sums: tuple, event: Boundary) -> tuple:
@@ -160,7 +160,7 @@ class LineTally(Tally):
         self.angular, self.symmetry = angular, symmetry
         line = abs(math.remainder(line_phi, 2 * math.pi)) if symmetry == "mirror" else line_phi
         self.line, self.half_width = (dr.opaque(types.Float, v) for v in (line, half_width))
-        self.edges2 = types.Float(np.asarray(edges, dtype=np.float64) ** 2)
+        self.edges2 = aligned(types.Float, np.asarray(edges, dtype=np.float64) ** 2)
         self.cells = CellSums(types, len(edges) - 1)
         low, high = max(line - half_width, 0.0), min(line + half_width, math.pi)
         self.angle = {"rotation": 2 * math.pi, "mirror": 2 * (high - low), "none": 2 * half_width}[symmetry]
@@ -345,7 +345,7 @@ def walk_passes(
     lanes, per_lane, passes = launch_shape(n_paths, dr.backend_v(types.Float) == dr.JitBackend.CUDA)
     for done in range(1, passes + 1):
         mu, recorded = _incidence(mu_i, lanes, np.random.default_rng([*seed, done])), tallies()
-        mu_in = types.Float(mu_internal(mu, medium.eta))
+        mu_in = aligned(types.Float, mu_internal(mu, medium.eta))
         sums, events = trace(types, medium, mu_in, per_lane, pass_seed(*seed, done), recorded)
         if progress:
             progress(done, passes)

@@ -190,7 +190,7 @@ M = Medium(1.0, 0.1)
 BAD = [
     (([], []), "media must be a list of one medium or more"),
     ((M, []), "media must be a list of one medium or more"),
-    (([M, "skin"], [1.0]), "layer 2: medium must be a Medium, got str"),
+    (([M, "skin"], [1.0]), "layer 2: medium must be a Medium or a Material, got 'skin'"),
     (([Medium([1.0, 2.0], 0.1), M], [1.0]), "layer 1: medium must have one channel"),
     (([M, Medium(1.0, 0.1, 0.0, 0.9)], [1.0]), "layer 2: eta must be >= 1, got 0.9"),
     (([M, M], [0.0]), "thickness of layer 1 must be finite and > 0"),
