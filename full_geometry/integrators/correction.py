@@ -199,11 +199,12 @@ def residuals(
     met, out = si.is_valid() & (si.shape == mi.ShapePtr(obj.geometry.shape)), exit_at(obj, si)
     dr.eval(ray, out, met)
 
-    # ---- W of a walk, and L_g = a B with orders 0 and 1
-    W, _, _ = tracer.trace(ray, PATH_LANES, (seed,))
+    # ---- W of a walk, and L_g = a B with order 1; order 0, which is exact where it is traced, is in neither
+    passes = 0 not in obj.low_orders
+    W, _, _ = replace(tracer, passes=passes).trace(ray, PATH_LANES, (seed,))
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, PER_LAUNCH)
-    parts, *_ = trace_paths(scene, objects, settings, sampler, ray, mi.Bool(True))
+    parts, *_ = trace_paths(scene, objects, settings, sampler, ray, mi.Bool(True), passes=passes)
     a = gathered.factor(out, met)
     r = W - gathered.radiance(out, met) - parts[1]
     point, near = gathered.points.nearest(out.p, out.n, met)

@@ -98,16 +98,17 @@ class PathState:
 
 def trace_paths(
     scene: mi.Scene, objects: list[TranslucentObject], settings: Settings, sampler: mi.Sampler, ray: mi.Ray3f,
-    active: mi.Bool, scattered: bool = False,
+    active: mi.Bool, scattered: bool = False, passes: bool = True,
 ) -> tuple[tuple[mi.Spectrum, mi.Spectrum], mi.Bool, mi.Spectrum]:  # fmt: skip
     """Radiance along a camera ray in two parts for a replay, whether the ray hits anything, and unconnected light.
 
     The second part is light of orders 0 and 1 of the object that the ray meets first. What phase sampling alone has hit
-    is in both. `scattered` says whether the ray is one of many that a vertex may have sent, as for a path that goes on.
+    is in both. `scattered` says whether the ray is one of many that a vertex may have sent, as for a path that goes on,
+    `passes` whether order 0 of the first object counts.
     """
     # the first pass adds up; L of both its parts begins at 0
     context = RenderContext.of(scene, objects, settings, Primal())
-    L, radiance, hit = _loop(context, sampler, ray, (mi.Spectrum(0), mi.Spectrum(0)), (), active, scattered)
+    L, radiance, hit = _loop(context, sampler, ray, (mi.Spectrum(0), mi.Spectrum(0)), (), active, scattered, passes)
     return L, hit, radiance.unconnected
 
 
@@ -134,7 +135,7 @@ def replay_paths(
 
 def _loop(
     context: RenderContext, sampler: mi.Sampler, camera_ray: mi.Ray3f, L: tuple[mi.Spectrum, mi.Spectrum],
-    derivative: mi.Spectrum | tuple[()], active: mi.Bool, scattered: bool = False,
+    derivative: mi.Spectrum | tuple[()], active: mi.Bool, scattered: bool = False, passes: bool = True,
 ) -> tuple[tuple[mi.Spectrum, mi.Spectrum], PathRadiance, mi.Bool]:  # fmt: skip
     """All vertices of a path, in one or two passes: L, what is summed, and whether the camera ray hits anything.
 
@@ -165,6 +166,9 @@ def _loop(
         vertex = Vertex(*met_surface(context, sampler, path.ray, si, active), path.ray, path.throughput,
                         first & path.second_pass, first & ~path.second_pass, path.scattered, active)  # fmt: skip
         following, radiance = sample_event(context, sampler, vertex, radiance)
+        if not passes:
+            unscattered = vertex.one_event_only & ~following.scattered
+            following = replace(following, weight=dr.select(unscattered, 0, following.weight))
         throughput = dr.select(active, path.throughput * following.weight, path.throughput)
 
         # ---- Russian roulette: survive with q = min(throughput, 0.95), throughput /= q

@@ -427,6 +427,7 @@ class PathTracer:
         hide_emitters: whether the camera sees no emitters.
         layers: whether emission that the camera sees, at once or in the mirror of an object, is also told apart.
         begins_inside: whether the object that a path meets first does not reflect it, but lets it in or ends it.
+        passes: whether light that passes the first object unscattered counts.
     """
 
     visitor: LightVisitor
@@ -435,6 +436,7 @@ class PathTracer:
     hide_emitters: bool
     layers: bool = False
     begins_inside: bool = False
+    passes: bool = True
 
     @property
     def begins_at(self) -> mi.UInt32:
@@ -528,6 +530,9 @@ class PathTracer:
         # ---- the surface, unless the path is as deep as it may get
         depth = p.depth + 1
         alive = si.is_valid() & (depth < mi.UInt32(self.max_depth))
+        if not self.passes:
+            unscattered = (p.depth == 1) & (p.walk.order == 0)
+            light, alive = replace(light, L=dr.select(unscattered, p.light.L, L)), alive & ~unscattered
         walk, skips = replace(p.walk, alive=alive), mi.Bool(False)
         if len(walk.within):
             walk, skips = self._skip(walk, si)
