@@ -76,12 +76,12 @@ class SurfaceCorrection:
     def of(cls, gathered: Gathered, halves: tuple[ResidualSums, ResidualSums], launches: int) -> SurfaceCorrection:
         """The regression of residuals."""
         points, geometry = gathered.points, gathered.object.geometry
-        p, n = (np.array(v, dtype=float).T for v in (points.p, points.n))
+        p, n, n_out = (np.array(v, dtype=float).T for v in (points.p, points.n, points.n_out))
         B = np.array(gathered.values, dtype=float).reshape(len(points), -1, gathered.terms)
         G = B[:, :, 0].mean(axis=1)
         G = (G - G.mean()) / max(float(G.std()), 1e-12 + 1e-3 * float(np.abs(G).mean()))
         found = levels(p, n, geometry.area, float(sum(half.number.sum() for half in halves)))
-        C, squared = smooth_field(found, p, G, halves)
+        C, squared = smooth_field(found, (p, n_out), G, halves)
         # RMS over points, over the mean of all light that leaves
         whole = np.square((halves[0] + halves[1]).mean).sum()
         return cls(gathered, halves, launches, C, float(np.sqrt(squared.mean() / whole)) if whole > 0 else 0.0)

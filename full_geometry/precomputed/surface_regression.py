@@ -7,18 +7,20 @@ polynomials of w up to the second degree (`directional`). About each of K centre
 
 G a feature of points that C may follow, as light that was gathered there, W_cj = (1 - d² / h²)² max(n_c.n_j, 0)². The
 weight a keeps the sum of the residuals about each centre. The fits of all centres in reach are blended by the same
-weights W_cj. Level 0 is one fit of all points, each further level has four times as many centres as the one before and
-fits what the coarser ones leave. C is the sum of what each level adds,
+weights W_cj. Before the levels, all residuals are fitted by (1, G) times polynomials of the cosine, as models err by it
+alike everywhere. Level 0 is one fit of all points, each further level has four times as many centres as the one before
+and fits what the coarser ones leave. C is the sum of what each level adds,
 
     C = C^(0) + Σ_l kappa_l d^(l),    kappa_l = S[d_1 d_2] / S[(d_1 + d_2)² / 4],
 
 d_1 and d_2 of two independent halves of the residuals, S a mean over the neighbourhood: the Wiener filter, as
-E[d_1 d_2] is the square of the field alone. So finer levels come in as residuals become many. The mean squared error
+E[d_1 d_2] is the square of the field alone. The mean over directions and what d has beyond it have a kappa each. So
+finer levels come in as residuals become many. The mean squared error
 
-    (1 - kappa)² S[d_1 d_2] of the finest level + (C_1 - C_2)² / 4
+    ((1 - kappa)² + 2) S[d_1 d_2] of the finest level + (C_1 - C_2)² / 4
 
-is what the filter takes away and the noise of the mean of C_1 and C_2, which the halves have apart; detail that no
-level has is not in it. Moon et al. (2014) and Bitterli et al. (2016) regress so over pixels.
+is what the filter takes away, finer detail as if each further level had half the power of the one before, and the
+noise of the mean of C_1 and C_2. Moon et al. (2014) and Bitterli et al. (2016) regress so over pixels.
 """
 
 from __future__ import annotations
@@ -36,6 +38,7 @@ RIDGE = 0.001  # of the sum of weights, on all but the constant; features are of
 NOISE = 20.0  # more of it for each residual: their variance over that of coefficients
 TERMS = 9  # of `directional`
 LEAST_OF_LEVEL = 24  # residuals for each centre of a level, on average
+FINER = 2.0  # power of detail that no level has, over that of the finest level
 
 
 def directional(x: Any, y: Any, z: Any) -> list[Any]:
@@ -188,39 +191,77 @@ def levels(p: np.ndarray, n: np.ndarray, area: float, residuals: float) -> list[
     return found
 
 
+class _Directions:
+    """Directions of the residuals of each point, by which fields are compared.
+
+    Args:
+        a: Σ a Y Y^T of points, (points, terms, terms).
+    """
+
+    def __init__(self, a: np.ndarray) -> None:
+        self._moments = a / np.maximum(a[:, :1, :1], 1e-30)
+        self._moments[:, 0, 0] = 1
+
+    def mean(self, C: np.ndarray) -> np.ndarray:
+        """The mean of fields (points, terms, channels) over directions, (points, channels)."""
+        return (self._moments[:, 0, :, None] * C).sum(axis=1)
+
+    def powers(self, C: np.ndarray, D: np.ndarray) -> list[np.ndarray]:
+        """The product of two fields: of their means over directions, and of what they have beyond; (points,) each."""
+        means = (self.mean(C) * self.mean(D)).sum(axis=1)
+        return [means, (self._moments * (C @ np.swapaxes(D, 1, 2))).sum(axis=(1, 2)) - means]
+
+    def scaled(self, C: np.ndarray, kappa: list[np.ndarray]) -> np.ndarray:
+        """A field whose mean over directions, and what it has beyond, are scaled by two factors (points,)."""
+        result = kappa[1][:, None, None] * C
+        result[:, 0] += (kappa[0] - kappa[1])[:, None] * self.mean(C)
+        return result
+
+
+def _zonal(n: np.ndarray, G: np.ndarray, sums: ResidualSums) -> np.ndarray:
+    """The field (1, G) (1, mu, mu²) of mu = n.w that fits all residuals best, (points, terms, channels)."""
+    # mu² = Σ n_i n_j w_i w_j in terms of Y, with |w| = 1
+    x, y, z = n.T
+    Z = np.zeros((3, len(n), TERMS))
+    Z[0, :, 0], Z[1, :, 1:4] = 1, n
+    Z[2, :, 0], Z[2, :, 4:] = 1 / 3, np.column_stack([x * x - 1 / 3, y * y - 1 / 3, 2 * x * y, 2 * x * z, 2 * y * z])
+    F = np.concatenate([Z, G[:, None] * Z])
+
+    # (Σ F^T a F) beta = Σ F^T r
+    aF = np.stack([(sums.a * f[:, None, :]).sum(axis=2) for f in F])
+    M, v = np.tensordot(F, aF, ((1, 2), (1, 2))), np.tensordot(F, sums.r, 2)
+    beta = np.linalg.solve(M + 1e-9 * max(float(M[0, 0]), 1e-30) * np.eye(len(F)), v)
+    return np.tensordot(F, beta, (0, 0))
+
+
 def smooth_field(
-    of: list[Level], p: np.ndarray, G: np.ndarray, halves: tuple[ResidualSums, ResidualSums]
+    of: list[Level], at: tuple[np.ndarray, np.ndarray], G: np.ndarray, halves: tuple[ResidualSums, ResidualSums]
 ) -> tuple[np.ndarray, np.ndarray]:
     """C (points, channels, terms), and its mean squared error (points,), the sum over channels.
 
     Args:
         of: levels.
-        p: positions (points, 3).
+        at: positions and normals (points, 3).
         G: a feature (points,), of the order of one.
         halves: independent residuals.
     """
-    # ---- mean Y of the residuals of each point, where C is compared
-    a = halves[0].a + halves[1].a
-    Y = a[:, 0] / np.maximum(a[:, :1, 0], 1e-30)
-    Y[:, 0] = 1
-
-    def value(C: np.ndarray) -> np.ndarray:
-        return (Y[:, :, None] * C).sum(axis=1)
-
-    # ---- one fit of all points, then what each level adds, filtered
+    # ---- one fit of all points by the cosine, then what each level adds, filtered from the second on
+    (p, n), directions = at, _Directions(halves[0].a + halves[1].a)
     features = np.column_stack([np.ones(len(p)), (p - p.mean(axis=0)) / size_of(p), G])
-    C, lost = [of[0].fitted(features, half) for half in halves], np.zeros(len(p))
-    for k, level in enumerate(of[1:]):
+    C, lost = [_zonal(n, G, half) for half in halves], np.zeros(len(p))
+    for k, level in enumerate(of):
         left = [replace(half, r=half.r - half.a @ C_half) for half, C_half in zip(halves, C)]
         d = [level.fitted(features, half) for half in left]
-        wide = of[max(k - 1, 0)]
-        signal = np.maximum(wide.averaged((value(d[0]) * value(d[1])).sum(axis=1)), 0)
-        power = wide.averaged(np.square(value(d[0] + d[1]) / 2).sum(axis=1))
-        kappa = np.minimum(signal / np.maximum(power, 1e-30), 1)
-        C = [C_half + kappa[:, None, None] * more for C_half, more in zip(C, d)]
-        lost = (1 - kappa) ** 2 * signal
+        if k > 0:
+            wide, mean = of[max(k - 2, 0)], 0.5 * (d[0] + d[1])
+            signal = [np.maximum(wide.averaged(v), 0) for v in directions.powers(*d)]
+            power = [wide.averaged(v) for v in directions.powers(mean, mean)]
+            kappa = [np.minimum(s / np.maximum(v, 1e-30), 1) for s, v in zip(signal, power)]
+            d = [directions.scaled(more, kappa) for more in d]
+            lost = sum(((1 - x) ** 2 + FINER) * s for x, s in zip(kappa, signal))
+        C = [C_half + more for C_half, more in zip(C, d)]
 
-    # ---- squared error: what the filter loses, and the noise of the mean of both halves
-    error = lost + 0.25 * np.square(value(C[0] - C[1])).sum(axis=1)
-    C = 0.5 * (C[0] + C[1])
-    return np.moveaxis(C, 1, 2), error
+    # ---- squared error: what the filter loses, finer detail, and the noise of the mean of both halves
+    apart = C[0] - C[1]
+    error = lost + 0.25 * np.maximum(sum(directions.powers(apart, apart)), 0)
+    return np.moveaxis(0.5 * (C[0] + C[1]), 1, 2), error

@@ -39,7 +39,7 @@ def _regression(residuals: int, seed: int = 0) -> tuple[float, float]:
         a = np.repeat(0.5 + 0.5 * (w * p[point]).sum(axis=1, keepdims=True), 3, axis=1)
         r = a * (constant[point] + 0.1 * w[:, :1]) * rng.exponential(size=(residuals // 2, 1))
         halves.append(ResidualSums.of(point, w, a, r, r, len(p)))
-    C, squared = smooth_field(levels(p, p, 4 * np.pi, residuals), p, G, (halves[0], halves[1]))
+    C, squared = smooth_field(levels(p, p, 4 * np.pi, residuals), (p, p), G, (halves[0], halves[1]))
     a = halves[0].a + halves[1].a
     Y = a[:, 0] / a[:, :1, 0]
     wanted = constant + 0.1 * Y[:, 1:2]
