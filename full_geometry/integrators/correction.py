@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 PER_LAUNCH = 2**16  # walks
 FEWEST, MOST = 2**17, 2**22  # walks of an object
 SAMPLES_PER_WALK = 8  # of the image
-# of five dimensions (Roberts 2018); those of four and a fifth power would leave directions on a line, as 1/g⁴ + 1/g⁵ = 1
+# of five dimensions (Roberts 2018): those of four and a fifth power leave directions on a line, as 1/g⁴ + 1/g⁵ = 1
 ROOTS = 0.8812714616335696, 0.7766393890897683, 0.6844301295853427, 0.6031687406857283, 0.5315553977157914
 LEAST_ALBEDO = 1e-6
 BRIGHTEST = 1 / 16384  # of the residuals of a launch, which are as bright as the next

@@ -192,7 +192,7 @@ def levels(p: np.ndarray, n: np.ndarray, area: float, residuals: float) -> list[
 
 
 class _Directions:
-    """Directions of the residuals of each point, by which fields are compared.
+    """Directions of the residuals of each point, by which fields are compared; where it has none they are not.
 
     Args:
         a: Σ a Y Y^T of points, (points, terms, terms).
@@ -200,7 +200,6 @@ class _Directions:
 
     def __init__(self, a: np.ndarray) -> None:
         self._moments = a / np.maximum(a[:, :1, :1], 1e-30)
-        self._moments[:, 0, 0] = 1
 
     def mean(self, C: np.ndarray) -> np.ndarray:
         """The mean of fields (points, terms, channels) over directions, (points, channels)."""
@@ -245,20 +244,19 @@ def smooth_field(
         G: a feature (points,), of the order of one.
         halves: independent residuals.
     """
-    # ---- one fit of all points by the cosine, then what each level adds, filtered from the second on
+    # ---- one fit of all points by the cosine, then what each level adds, filtered
     (p, n), directions = at, _Directions(halves[0].a + halves[1].a)
     features = np.column_stack([np.ones(len(p)), (p - p.mean(axis=0)) / size_of(p), G])
     C, lost = [_zonal(n, G, half) for half in halves], np.zeros(len(p))
     for k, level in enumerate(of):
         left = [replace(half, r=half.r - half.a @ C_half) for half, C_half in zip(halves, C)]
         d = [level.fitted(features, half) for half in left]
-        if k > 0:
-            wide, mean = of[max(k - 2, 0)], 0.5 * (d[0] + d[1])
-            signal = [np.maximum(wide.averaged(v), 0) for v in directions.powers(*d)]
-            power = [wide.averaged(v) for v in directions.powers(mean, mean)]
-            kappa = [np.minimum(s / np.maximum(v, 1e-30), 1) for s, v in zip(signal, power)]
-            d = [directions.scaled(more, kappa) for more in d]
-            lost = sum(((1 - x) ** 2 + FINER) * s for x, s in zip(kappa, signal))
+        wide, mean = of[max(k - 2, 0)], 0.5 * (d[0] + d[1])
+        signal = [np.maximum(wide.averaged(v), 0) for v in directions.powers(*d)]
+        power = [wide.averaged(v) for v in directions.powers(mean, mean)]
+        kappa = [np.minimum(s / np.maximum(v, 1e-30), 1) for s, v in zip(signal, power)]
+        d = [directions.scaled(more, kappa) for more in d]
+        lost = sum(((1 - x) ** 2 + FINER) * s for x, s in zip(kappa, signal))
         C = [C_half + more for C_half, more in zip(C, d)]
 
     # ---- squared error: what the filter loses, finer detail, and the noise of the mean of both halves
