@@ -5,11 +5,12 @@ in at x_o against w_o, both without what the boundary reflects at x_o,
 
     L_o = L_g + a(w_o) C(x_o, w_o),    a C = E[W - L_g].
 
-C, a polynomial of the second degree of w_o bent by the boundary, is smooth where the model has the detail of light. It
-is fitted to W - L_g at random places and directions (`precomputed.surface_regression`). It stays until light or objects
-change; more walks make it finer. Walks find light precomputed where that is possible (`precomputed.unscattered_light`).
+C, a polynomial of w_o bent by the boundary, is smooth where the model has the detail of light. It is fitted to W - L_g
+at random places and directions (`precomputed.surface_regression`). It stays until light or objects change; more walks
+make it finer. Walks find light precomputed where that is possible (`precomputed.unscattered_light`).
 
-Not corrected: detail that is finer than the distance of points, and C beyond its second degree in w_o.
+Not corrected: detail that is finer than the distance of points, and C beyond its second degree in w_o, or the third of
+its cosine.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from full_geometry.integrators.gathering import Gathered
 from full_geometry.integrators.inner_light import cut_to_next
 from full_geometry.integrators.surface_paths import exit_at, trace_paths
 from full_geometry.integrators.walk_paths import PathTracer
-from full_geometry.precomputed.surface_regression import ResidualSums, levels, smooth_field
+from full_geometry.precomputed.surface_regression import ResidualSums, directional, levels, smooth_field
 from full_geometry.precomputed.transport_matrix import bent
 from full_geometry.walk.random_walk import PATH_LANES
 from halfspace_sss.backend import clock
@@ -210,9 +211,10 @@ def residuals(
     r = W - gathered.radiance(out, met) - parts[1]
     point, near = gathered.points.nearest(out.p, out.n, met)
     bent_w = bent(out.w, out.n_out, gathered.albedo.eta)
+    mu = dr.dot(bent_w, out.n_out)
     lanes = dr.zeros(mi.Float, PER_LAUNCH)
     a, r, W = mi.Spectrum(a) + lanes, mi.Spectrum(r) + lanes, mi.Spectrum(W) + lanes
-    dr.eval(a, r, W, point, near, bent_w)
+    dr.eval(a, r, W, point, near, bent_w, mu)
 
     if not dr.all(dr.isfinite(dr.sum(r)))[0]:
         raise ValueError(f"light of walks at object {obj.geometry.name} must be finite, got NaN or infinity")
@@ -222,7 +224,8 @@ def residuals(
     a, r, W, bent_w = (np.array(v, dtype=float)[:, kept].T for v in (a, r, W, bent_w))
     a = a / scale_of(gathered)
     r = _steadied(r, a)
-    return ResidualSums.of(np.array(point)[kept], bent_w, a, r, W, len(gathered.points))
+    Y = np.stack(directional(*bent_w.T, np.array(mu, dtype=float)[kept]), axis=1)
+    return ResidualSums.of(np.array(point)[kept], Y, a, r, W, len(gathered.points))
 
 
 def _steadied(r: np.ndarray, a: np.ndarray) -> np.ndarray:

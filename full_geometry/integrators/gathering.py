@@ -99,7 +99,7 @@ class Gathered:
         size = dr.size_v(mi.Spectrum)
         B = self.points.blend(self.values, self.terms * size, out.p, out.n, active)
         w = bent(out.w, out.n_out, self.albedo.eta)
-        Y = directional(w.x, w.y, w.z)
+        Y = directional(w.x, w.y, w.z, dr.dot(w, out.n_out))
         rows = [B[self.terms * c : self.terms * (c + 1)] for c in range(size)]
         B = mi.Spectrum([sum(b * y for b, y in zip(row, Y)) for row in rows])
 

@@ -1,17 +1,18 @@
 """A smooth field over a surface from noisy residuals, by local regressions of several widths.
 
 Residuals r_s at places of points j in directions w_s are fitted by r = a(w) C_j . Y(w), Y the
-polynomials of w up to the second degree (`directional`). About each of K centres the weighted least squares
+polynomials of w up to the second degree and one of its cosine (`directional`). About each of K centres the
+weighted least squares
 
     min Σ_j W_cj Σ_s a_s (r_s / a_s - beta . phi_js)²,    phi = ((x_j - x_c) / h, G_j - G_c, Y(w_s)),
 
 G a feature of points that C may follow, as light that was gathered there, W_cj = (1 - d² / h²)² max(n_c.n_j, 0)². The
 weight a keeps the sum of the residuals about each centre. The fits of all centres in reach are blended by the same
-weights W_cj. Before the levels, all residuals are fitted by (1, G) times polynomials of the cosine, as models err by it
-alike everywhere. Level 0 is one fit of all points, each further level has four times as many centres as the one before
-and fits what the coarser ones leave. C is the sum of what each level adds,
+weights W_cj. Before the levels, all residuals are fitted by (1, G) times cubic polynomials of the cosine, by which
+models err alike everywhere. Level 0 is one fit of all points, each further level has four times as many centres as the
+one before and fits what the coarser ones leave. C is the first fit Z and what each level adds,
 
-    C = C^(0) + Σ_l kappa_l d^(l),    kappa_l = S[d_1 d_2] / S[(d_1 + d_2)² / 4],
+    C = Z + Σ_l kappa_l d^(l),    kappa_l = S[d_1 d_2] / S[(d_1 + d_2)² / 4],
 
 d_1 and d_2 of two independent halves of the residuals, S a mean over the neighbourhood: the Wiener filter, as
 E[d_1 d_2] is the square of the field alone. The mean over directions and what d has beyond it have a kappa each. So
@@ -36,14 +37,18 @@ FIRST_CENTRES, FACTOR = 16, 4
 REACH = 2.0  # h over the mean distance of centres
 RIDGE = 0.001  # of the sum of weights, on all but the constant; features are of the order of one
 NOISE = 20.0  # more of it for each residual: their variance over that of coefficients
-TERMS = 9  # of `directional`
+TERMS, LOCAL = 10, 9  # of `directional`, and those that levels fit
 LEAST_OF_LEVEL = 24  # residuals for each centre of a level, on average
 FINER = 2.0  # power of detail that no level has, over that of the finest level
 
 
-def directional(x: Any, y: Any, z: Any) -> list[Any]:
-    """Y of a direction: 1, x, y, z, x² - z², y² - z², xy, xz, yz, for arrays of any kind."""
-    return [x * 0 + 1, x, y, z, x * x - z * z, y * y - z * z, x * y, x * z, y * z]
+def directional(x: Any, y: Any, z: Any, mu: Any) -> list[Any]:
+    """Y of a direction of cosine mu: 1, x, y, z, x² - z², y² - z², xy, xz, yz, ((mu - .85) / .15)³, of any arrays.
+
+    Directions inside that refraction reaches have a mu of .7 to 1, for an index of 1.4.
+    """
+    t = (mu - 0.85) * (1 / 0.15)
+    return [x * 0 + 1, x, y, z, x * x - z * z, y * y - z * z, x * y, x * z, y * z, t * t * t]
 
 
 @dataclass(frozen=True)
@@ -70,20 +75,19 @@ class ResidualSums:
 
     @classmethod
     def of(
-        cls, point: np.ndarray, w: np.ndarray, a: np.ndarray, r: np.ndarray, light: np.ndarray, points: int
+        cls, point: np.ndarray, Y: np.ndarray, a: np.ndarray, r: np.ndarray, light: np.ndarray, points: int
     ) -> ResidualSums:  # fmt: skip
-        """Sums of residuals r (n, channels) of light (n, channels) in directions w (n, 3) at points.
+        """Sums of residuals r (n, channels) of light (n, channels) in directions of Y (n, terms) at points.
 
         Their factors a (n, channels) are above 0.
         """
         # a is the mean over the channels, so that all have the same weights
         weight = a.mean(axis=1)
-        phi = np.stack(directional(*w.T), axis=1)
-        outer = (weight[:, None, None] * phi[:, :, None] * phi[:, None, :]).reshape(len(w), -1)
-        right = ((weight[:, None] * r / a)[:, None, :] * phi[:, :, None]).reshape(len(w), -1)
-        at = csr_array((np.ones(len(w)), (point, np.arange(len(w)))), shape=(points, len(w)))
+        outer = (weight[:, None, None] * Y[:, :, None] * Y[:, None, :]).reshape(len(Y), -1)
+        right = ((weight[:, None] * r / a)[:, None, :] * Y[:, :, None]).reshape(len(Y), -1)
+        at, terms = csr_array((np.ones(len(Y)), (point, np.arange(len(Y)))), shape=(points, len(Y))), Y.shape[1]
         number = np.bincount(point, minlength=points).astype(float)
-        return cls(number, (at @ outer).reshape(points, TERMS, TERMS), (at @ right).reshape(points, TERMS, -1),
+        return cls(number, (at @ outer).reshape(points, terms, terms), (at @ right).reshape(points, terms, -1),
                    light.sum(axis=0))  # fmt: skip
 
     def __add__(self, other: ResidualSums) -> ResidualSums:
@@ -139,9 +143,9 @@ class Level:
         """
         # ---- moments about each centre, of phi = (1, u, Y): Σ_j W_cj Σ_s a phi phi^T and Σ_j W_cj Σ_s a phi r / a
         N, U = features.shape
-        more = TERMS - 1
+        more, of = LOCAL - 1, slice(1, LOCAL)
         D, W = U + more, self.weights
-        ones, w = sums.a[:, 0, 0], sums.a[:, 0, 1:]
+        ones, w = sums.a[:, 0, 0], sums.a[:, 0, of]
         uu = ones[:, None, None] * features[:, :, None] * features[:, None, :]
         uw = features[:, :, None] * w[:, None, :]
         ur = features[:, :, None] * sums.r[:, None, 0]
@@ -150,9 +154,9 @@ class Level:
         M[:, :U, :U] = (W @ uu.reshape(N, -1)).reshape(K, U, U)
         M[:, :U, U:] = (W @ uw.reshape(N, -1)).reshape(K, U, more)
         M[:, U:, :U] = np.swapaxes(M[:, :U, U:], 1, 2)
-        M[:, U:, U:] = (W @ sums.a[:, 1:, 1:].reshape(N, -1)).reshape(K, more, more)
+        M[:, U:, U:] = (W @ sums.a[:, of, of].reshape(N, -1)).reshape(K, more, more)
         v[:, :U] = (W @ ur.reshape(N, -1)).reshape(K, U, -1)
-        v[:, U:] = (W @ sums.r[:, 1:].reshape(N, -1)).reshape(K, more, -1)
+        v[:, U:] = (W @ sums.r[:, of].reshape(N, -1)).reshape(K, more, -1)
 
         # ---- features less those of the centre, places over h: phi_c = T phi
         T = np.tile(np.eye(D), (K, 1, 1))
@@ -172,7 +176,7 @@ class Level:
         total = np.asarray(known.sum(axis=1)).ravel()
         beta = (known @ beta.reshape(K, -1)).reshape(N, D, -1) / np.maximum(total, 1e-30)[:, None, None]
         constant = (features[:, :, None] * beta[:, :U]).sum(axis=1, keepdims=True)
-        return np.concatenate([constant, beta[:, U:]], axis=1)
+        return np.concatenate([constant, beta[:, U:], np.zeros_like(beta[:, : TERMS - LOCAL])], axis=1)
 
     def averaged(self, x: np.ndarray) -> np.ndarray:
         """The mean of a value of points (points,) over the neighbourhood: to the centres and back."""
@@ -218,12 +222,15 @@ class _Directions:
 
 
 def _zonal(n: np.ndarray, G: np.ndarray, sums: ResidualSums) -> np.ndarray:
-    """The field (1, G) (1, mu, mu²) of mu = n.w that fits all residuals best, (points, terms, channels)."""
+    """The field (1, G) (1, mu, mu², mu³) of mu = n.w that fits all residuals best, (points, terms, channels)."""
     # mu² = Σ n_i n_j w_i w_j in terms of Y, with |w| = 1
     x, y, z = n.T
-    Z = np.zeros((3, len(n), TERMS))
-    Z[0, :, 0], Z[1, :, 1:4] = 1, n
-    Z[2, :, 0], Z[2, :, 4:] = 1 / 3, np.column_stack([x * x - 1 / 3, y * y - 1 / 3, 2 * x * y, 2 * x * z, 2 * y * z])
+    Z = np.zeros((4, len(n), TERMS))
+    Z[0, :, 0], Z[1, :, 1:4], Z[3, :, LOCAL] = 1, n, 1
+    Z[2, :, 0], Z[2, :, 4:LOCAL] = (
+        1 / 3,
+        np.column_stack([x * x - 1 / 3, y * y - 1 / 3, 2 * x * y, 2 * x * z, 2 * y * z]),
+    )
     F = np.concatenate([Z, G[:, None] * Z])
 
     # (Σ F^T a F) beta = Σ F^T r

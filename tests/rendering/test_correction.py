@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from full_geometry.integrators.correction import Corrections
-from full_geometry.precomputed.surface_regression import ResidualSums, levels, smooth_field
+from full_geometry.precomputed.surface_regression import TERMS, ResidualSums, directional, levels, smooth_field
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -38,7 +38,8 @@ def _regression(residuals: int, seed: int = 0) -> tuple[float, float]:
         w *= (np.sign((w * p[point]).sum(axis=1)) / np.linalg.norm(w, axis=1))[:, None]
         a = np.repeat(0.5 + 0.5 * (w * p[point]).sum(axis=1, keepdims=True), 3, axis=1)
         r = a * (constant[point] + 0.1 * w[:, :1]) * rng.exponential(size=(residuals // 2, 1))
-        halves.append(ResidualSums.of(point, w, a, r, r, len(p)))
+        Y = np.stack(directional(*w.T, (w * p[point]).sum(axis=1)), axis=1)
+        halves.append(ResidualSums.of(point, Y, a, r, r, len(p)))
     C, squared = smooth_field(levels(p, p, 4 * np.pi, residuals), (p, p), G, (halves[0], halves[1]))
     a = halves[0].a + halves[1].a
     Y = a[:, 0] / a[:, :1, 0]
@@ -58,9 +59,9 @@ def test_the_error_of_a_field_falls_with_the_residuals_and_is_told_within_a_fact
 
 def test_sums_of_two_sets_of_residuals_are_those_of_both() -> None:
     rng = np.random.default_rng(1)
-    point, w, a, r = rng.integers(0, 5, 60), rng.normal(size=(60, 3)), rng.random((60, 3)) + 0.1, rng.random((60, 3))
+    point, Y, a, r = rng.integers(0, 5, 60), rng.normal(size=(60, 4)), rng.random((60, 3)) + 0.1, rng.random((60, 3))
     parts = [
-        ResidualSums.of(point[s], w[s], a[s], r[s], r[s] + 1, 5) for s in (slice(0, 40), slice(40, 60), slice(0, 60))
+        ResidualSums.of(point[s], Y[s], a[s], r[s], r[s] + 1, 5) for s in (slice(0, 40), slice(40, 60), slice(0, 60))
     ]
     both, whole = parts[0] + parts[1], parts[2]
     for x, y in ((both.number, whole.number), (both.a, whole.a), (both.r, whole.r), (both.mean, whole.mean)):
@@ -170,7 +171,7 @@ def test_walks_that_are_added_have_seeds_of_their_own_however_many_were_lost(
         seeds.append(arguments[-1])
         points = len(arguments[1][0].gathered.points)
         return ResidualSums.of(
-            np.zeros(9, int), np.ones((9, 3)), np.ones((9, 3)), np.ones((9, 3)), np.ones((9, 3)), points
+            np.zeros(9, int), np.ones((9, TERMS)), np.ones((9, 3)), np.ones((9, 3)), np.ones((9, 3)), points
         )
 
     monkeypatch.setattr(correction, "residuals", few)
