@@ -22,7 +22,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.geometry.light_points import lattice, uniform_entries
+from full_geometry.geometry.light_points import GOLDEN, lattice, uniform_entries
 from full_geometry.geometry.points import cosine_above, floats, place
 from full_geometry.geometry.rounding import ray_from
 from full_geometry.geometry.snapshot import same_objects
@@ -30,6 +30,7 @@ from full_geometry.integrators.gathering import Gathered
 from full_geometry.integrators.inner_light import cut_to_next
 from full_geometry.integrators.surface_paths import exit_at, trace_paths
 from full_geometry.integrators.walk_paths import PathTracer
+from full_geometry.precomputed.lit_points import R_4
 from full_geometry.precomputed.surface_regression import ResidualSums, directional, levels, smooth_field
 from full_geometry.precomputed.transport_matrix import bent
 from full_geometry.walk.random_walk import PATH_LANES
@@ -43,8 +44,7 @@ if TYPE_CHECKING:
 PER_LAUNCH = 2**16  # walks
 FEWEST, MOST = 2**17, 2**22  # walks of an object
 SAMPLES_PER_WALK = 8  # of the image
-# of five dimensions (Roberts 2018): those of four and a fifth power leave directions on a line, as 1/g⁴ + 1/g⁵ = 1
-ROOTS = 0.8812714616335696, 0.7766393890897683, 0.6844301295853427, 0.6031687406857283, 0.5315553977157914
+ROOTS = (*R_4, GOLDEN)  # not the fifth power of the same root: directions would lie on a line, as 1/g⁴ + 1/g⁵ = 1
 LEAST_ALBEDO = 1e-6
 BRIGHTEST = 1 / 16384  # of the residuals of a launch, which are as bright as the next
 SEED = 500

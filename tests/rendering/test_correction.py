@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
 import pytest
 
-from full_geometry.integrators.correction import Corrections
+from full_geometry.geometry.light_points import lattice
+from full_geometry.integrators.correction import PER_LAUNCH, ROOTS, Corrections
 from full_geometry.precomputed.surface_regression import TERMS, ResidualSums, directional, levels, smooth_field
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -27,8 +29,11 @@ def _sphere(count: int) -> np.ndarray:
     return np.column_stack([np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z])
 
 
-def _regression(residuals: int, seed: int = 0) -> tuple[float, float]:
-    """RMS of a known field on a sphere by noisy residuals, and what is told, over the RMS of the field."""
+def _regression(residuals: int, seed: int = 0) -> tuple[float, float, float]:
+    """RMS error of a known field on a sphere by noisy residuals, what is told, and the mean error along normals.
+
+    All are over the RMS of the field.
+    """
     rng, p = np.random.default_rng(seed), _sphere(2048)
     G = np.where(p[:, 0] > 0.2, 1.0, 0.2)
     constant = (0.3 + 0.2 * p[:, 2] + 0.5 * G + 0.1 * np.sin(4 * p[:, 1]))[:, None] * np.array([1.0, 0.8, 0.5])
@@ -37,24 +42,34 @@ def _regression(residuals: int, seed: int = 0) -> tuple[float, float]:
         point, w = rng.integers(0, len(p), residuals // 2), rng.normal(size=(residuals // 2, 3))
         w *= (np.sign((w * p[point]).sum(axis=1)) / np.linalg.norm(w, axis=1))[:, None]
         a = np.repeat(0.5 + 0.5 * (w * p[point]).sum(axis=1, keepdims=True), 3, axis=1)
-        r = a * (constant[point] + 0.1 * w[:, :1]) * rng.exponential(size=(residuals // 2, 1))
-        Y = np.stack(directional(*w.T, (w * p[point]).sum(axis=1)), axis=1)
+        Y = np.stack(directional(*w.T, 0.7 + 0.3 * (w * p[point]).sum(axis=1)), axis=1)
+        r = a * (constant[point] + 0.1 * w[:, :1] + 0.2 * Y[:, -1:]) * rng.exponential(size=(residuals // 2, 1))
         halves.append(ResidualSums.of(point, Y, a, r, r, len(p)))
     C, squared = smooth_field(levels(p, p, 4 * np.pi, residuals), (p, p), G, (halves[0], halves[1]))
     a = halves[0].a + halves[1].a
     Y = a[:, 0] / a[:, :1, 0]
-    wanted = constant + 0.1 * Y[:, 1:2]
+    wanted = constant + 0.1 * Y[:, 1:2] + 0.2 * Y[:, -1:]
     found = (C * Y[:, None, :]).sum(axis=2)
     whole = np.square(wanted).sum(axis=1).mean()
-    return np.sqrt(np.square(found - wanted).sum(axis=1).mean() / whole), np.sqrt(squared.mean() / whole)
+    along = np.stack(directional(*p.T, np.ones(len(p))), axis=1)
+    bias = ((C * along[:, None, :]).sum(axis=2) - constant - 0.1 * p[:, :1] - 0.2).mean() / np.sqrt(whole / 3)
+    return np.sqrt(np.square(found - wanted).sum(axis=1).mean() / whole), np.sqrt(squared.mean() / whole), bias
 
 
 def test_the_error_of_a_field_falls_with_the_residuals_and_is_told_within_a_factor_of_two() -> None:
     errors = [_regression(n) for n in (2**14, 2**17, 2**20)]
-    found, told = np.array(errors).T
+    found, told, along_normals = np.array(errors).T
     assert (found[1:] < found[:-1] / 1.25).all()
+    assert np.abs(along_normals[-1]) < 0.01
     assert found[-1] < 0.03
     assert ((told / found > 0.5) & (told / found < 2)).all()
+
+
+def test_places_and_directions_of_walks_are_even_in_each_pair_of_dimensions() -> None:
+    u = np.array(lattice(PER_LAUNCH, ROOTS, [0.5] * 5))
+    for i, j in itertools.combinations(range(5), 2):
+        counts = np.histogram2d(u[i], u[j], 16, ((0, 1), (0, 1)))[0]
+        assert np.abs(counts / counts.mean() - 1).max() < 0.2, (i, j)
 
 
 def test_sums_of_two_sets_of_residuals_are_those_of_both() -> None:
