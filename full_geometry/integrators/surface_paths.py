@@ -166,10 +166,8 @@ def _loop(
         vertex = Vertex(*met_surface(context, sampler, path.ray, si, active), path.ray, path.throughput,
                         first & path.second_pass, first & ~path.second_pass, path.scattered, active)  # fmt: skip
         following, radiance = sample_event(context, sampler, vertex, radiance)
-        if not passes:
-            unscattered = vertex.one_event_only & ~following.scattered
-            following = replace(following, weight=dr.select(unscattered, 0, following.weight))
-        throughput = dr.select(active, path.throughput * following.weight, path.throughput)
+        counts = mi.Bool(passes) | ~vertex.one_event_only | following.scattered
+        throughput = dr.select(active, path.throughput * dr.select(counts, following.weight, 0), path.throughput)
 
         # ---- Russian roulette: survive with q = min(throughput, 0.95), throughput /= q
         largest = dr.max(throughput)
