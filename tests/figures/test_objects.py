@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import pytest
 
@@ -25,7 +27,7 @@ def varying() -> dict[str, objects.Varying]:
 
 @pytest.fixture(scope="module")
 def made(varying: dict) -> dict[str, meshes.Mesh]:
-    return {**{name: each.mesh for name, each in varying.items()}, "candle": objects.make_candle(LOW).wax}
+    return {**{name: each.mesh for name, each in varying.items()}, "candle": candle(0).wax}
 
 
 @pytest.fixture(scope="module")
@@ -33,9 +35,14 @@ def media(varying: dict) -> dict[str, objects.Grid]:
     return {name: each.grid for name, each in varying.items()}
 
 
+@functools.cache
+def candle(seed: int) -> objects.Candle:
+    return objects.make_candle(LOW, seed)
+
+
 def vertices(name: str, seed: int) -> np.ndarray:
     if name == "candle":
-        return objects.make_candle(LOW, seed).wax.vertices
+        return (candle(seed) if seed else objects.make_candle(LOW)).wax.vertices
     return objects.make_varying(name, LOW, 8, seed).mesh.vertices
 
 
@@ -115,14 +122,14 @@ def test_another_resolution_changes_the_volume_by_less_than_2_percent(chosen: st
 def test_the_flame_lies_inside_the_convex_hull_of_the_candle_but_outside_of_the_wax(seed: int) -> None:
     from scipy.spatial import Delaunay
 
-    found = objects.make_candle(LOW, seed)
+    found = candle(seed)
     assert (Delaunay(found.wax.vertices[::5]).find_simplex(found.flame.vertices) >= 0).all()
     winding = igl.fast_winding_number(found.wax.vertices, found.wax.faces.astype(np.int64), found.flame.vertices)
     assert np.abs(winding).max() < 0.1
 
 
 def test_the_wick_does_not_touch_the_wax() -> None:
-    found = objects.make_candle(LOW)
+    found = candle(0)
     drips = objects._drips(0)
     assert objects.wax_distance(found.wick.vertices, 0, drips).min() > 0.02
 

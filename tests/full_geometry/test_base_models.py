@@ -50,7 +50,10 @@ def learnt(folder: Path, base_model: str = SHAPE, **more) -> Trained:
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     mi.set_variant("llvm_ad_mono")
-    return learnt(tmp_path_factory.mktemp("weights"))
+    with pytest.MonkeyPatch.context() as patch:  # nobody asks for its errors
+        for name, value in {"EXITS": 64, "WALKS": 512, "SAMPLES": 256}.items():
+            patch.setattr(training, name, value)
+        return learnt(tmp_path_factory.mktemp("weights"))
 
 
 def points(of: TranslucentObject, n: int = 1024) -> list[SurfacePoint]:
