@@ -15,7 +15,7 @@ from figures.parts.command import COMMANDS as FIGURES
 from halfspace_sss.cli.shared import Commands, add, group
 
 figures.ADDED |= {"equal_error": "benchmarks.equal_error", "trade": "benchmarks.trade_figure"}
-STUDIES = ("gathered", "scenes", "spheres", "textures", "thin")
+STUDIES = ("gallery", "gathered", "scenes", "spheres", "textures", "thin")
 figures.ADDED |= {name: f"benchmarks.{name}_figure" for name in STUDIES}
 figures.ADDED |= {name: f"benchmarks.published.{name}" for name in ("fig03", "fig07", "fig08", "table1")}
 COMMANDS = {

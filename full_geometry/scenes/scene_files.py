@@ -178,6 +178,8 @@ def open_scene(
     names = [str(props.get("model", "")) for props in _surfaces(state)]
     _transform(scene, state, config, apart=walks or _apart(state, model))
     for props in _surfaces(state):  # anew: the nodes have moved
+        if "thickness" in props:  # thin walls have neither
+            continue
         if model and not walks:
             props["model"] = model
         if orders:
