@@ -31,8 +31,7 @@ if TYPE_CHECKING:
     from halfspace_sss.comparison.reflectance_curves import curves
     from halfspace_sss.interface.model import BSSRDF
     from halfspace_sss.maps.map_store import make_maps
-    from halfspace_sss.physics.layers import Layers
-    from halfspace_sss.physics.medium import Medium
+    from halfspace_sss.physics.medium import Layers, Medium
     from halfspace_sss.registry import bssrdf, models, register_model
     from halfspace_sss.tracing.instrument import Fibre, Instrument, Ring
     from halfspace_sss.tracing.tracer import trace
@@ -46,7 +45,7 @@ __all__ = [
 
 __getattr__, __dir__ = lazy_names(__name__, {
     "": ["materials", "measure", "neural"], "comparison.reflectance_curves": ["curves"], "interface.model": ["BSSRDF"],
-    "maps.map_store": ["make_maps"], "physics.layers": ["Layers"], "physics.medium": ["Medium"],
+    "maps.map_store": ["make_maps"], "physics.medium": ["Layers", "Medium"],
     "registry": ["bssrdf", "models", "register_model"], "tracing.instrument": ["Fibre", "Instrument", "Ring"],
     "tracing.tracer": ["trace"],
 })  # fmt: skip

@@ -12,7 +12,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from halfspace_sss.checks import check_choice
 from halfspace_sss.lazy import once
 
 if TYPE_CHECKING:
@@ -189,7 +188,8 @@ def array_types(backend: str = "llvm") -> ModuleType:
         ValueError: the name is not a backend.
         BackendError: the backend cannot run on this machine.
     """
-    check_choice("backend", backend, BACKENDS)
+    if backend not in BACKENDS:
+        raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
     if backend == "llvm":
         prepare_llvm()
     import drjit as dr

@@ -14,8 +14,7 @@ from halfspace_sss.extensions import FAILURES, MODELS, offered, warn_left_out
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.lazy import once
 from halfspace_sss.neural import MODELS as NEURAL
-from halfspace_sss.physics.layers import Layers
-from halfspace_sss.physics.medium import Medium, medium_of
+from halfspace_sss.physics.medium import Layers, Medium, medium_of
 
 _registered: dict[str, type[BSSRDF]] = {}
 

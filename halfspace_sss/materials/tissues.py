@@ -25,7 +25,7 @@ import numpy as np
 
 from halfspace_sss.checks import check_choice, check_interval
 from halfspace_sss.materials.spectra import SpectralMedium
-from halfspace_sss.physics.layers import Layers
+from halfspace_sss.physics.medium import Layers
 
 HAEMOGLOBIN = 150 / 64500  # mol/l in whole blood
 EPIDERMIS_MM = 0.06

@@ -18,8 +18,7 @@ import numpy as np
 from halfspace_sss.arrays import Lanes, aligned
 from halfspace_sss.checks import check_choice, check_edges
 from halfspace_sss.physics.fresnel import F_t, mu_internal
-from halfspace_sss.physics.layers import Layers
-from halfspace_sss.physics.medium import Medium, eval_hg
+from halfspace_sss.physics.medium import Layers, Medium, eval_hg
 from halfspace_sss.progress import Progress
 from halfspace_sss.tracing.walk import Boundary, Scatter, Tally, pass_seed, walk
 

@@ -14,8 +14,7 @@ import numpy as np
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import as_count, check_cosine, check_count, check_edges, check_finite, check_interval
 from halfspace_sss.physics.fresnel import F_t
-from halfspace_sss.physics.layers import Layers
-from halfspace_sss.physics.medium import Medium, check_scalar_medium, medium_of
+from halfspace_sss.physics.medium import Layers, Medium, check_scalar_medium, medium_of
 from halfspace_sss.progress import Progress
 from halfspace_sss.tracing.instrument import Instrument, Readings, Recorder, transformed
 from halfspace_sss.tracing.layer_tracing import LayerTrace, trace_layers

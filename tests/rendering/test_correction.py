@@ -150,6 +150,7 @@ def test_a_medium_without_absorption_is_invisible_in_uniform_light() -> None:
     assert np.abs(corrected - 1).max() < 0.03
 
 
+@pytest.mark.slow
 def test_it_has_the_mean_of_walks_through_a_rough_boundary_within_1_percent_where_the_model_is_smooth(
     scene: Any,
 ) -> None:
