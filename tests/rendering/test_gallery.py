@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks import gallery_figure
 from full_geometry.integrators import gathering
 from full_geometry.scenes.scene_files import load_scene
 
@@ -31,7 +32,10 @@ def _mean(scene: mi.Scene, spp: int, passes: int = 8) -> tuple[np.ndarray, np.nd
 
 
 def test_every_scene_has_a_test() -> None:
-    assert sorted(path.stem for path in FOLDER.glob("*.xml")) == sorted(CORRECTED + PRECOMPUTED + WALKED)
+    names = sorted(path.stem for path in FOLDER.glob("*.xml"))
+    assert names == sorted(CORRECTED + PRECOMPUTED + WALKED) == sorted(gallery_figure.SCENES)
+    draft, paper = gallery_figure.parts("draft"), gallery_figure.parts("paper")
+    assert len({part.name for part in draft}) == len(draft) == len(paper) == 16
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ import pytest
 
 from full_geometry.scenes.gltf import gltf_scene
 from full_geometry.scenes.scene_files import load_scene, names_nothing, open_scene
+from full_geometry.surface.sheets import is_sheet
 from full_geometry.surface.wrapped import surface_of, wrapping_of
 from halfspace_sss import Medium
 from halfspace_sss.materials import load
@@ -168,6 +169,12 @@ def test_a_weight_blends_the_medium_with_the_surface(tmp_path: Path) -> None:
     assert float(around.mixes[0].share(dr.zeros(mi.SurfaceInteraction3f), mi.Bool(True))[0]) == 0.25
     with pytest.raises(ValueError, match=r"sss_weight must be a number in \(0, 1\], got 2"):
         gltf_scene(_glb(tmp_path, {**SKIN, "sss_weight": 2}))
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_thickness_makes_a_thin_wall(tmp_path: Path) -> None:
+    look = gltf_scene(_glb(tmp_path, {"sss_mfp": [1.2, 0.5, 0.3], "sss_thickness": 0.3}))["material skin"]
+    assert is_sheet(mi.load_dict(look))
 
 
 def test_what_is_not_taken_is_listed_once(tmp_path: Path) -> None:
