@@ -6,6 +6,7 @@ over their number on a CPU, of the wall on a GPU.
 
 from __future__ import annotations
 
+import gc
 import os
 import subprocess
 import sys
@@ -78,6 +79,7 @@ def bench_renders(variant: str, size: int, training: float = 0.0, spp: int = SPP
                 for way in ways:
                     n = min(spp, LEARNT_SPP) if way == LEARNT else spp
                     image_of_pass(fresh(way), n, 1)  # compiles
+                    gc.collect()  # the numbers of its objects are in kernels: those of the next are then the same
                     scene, images, took = fresh(way), [], []
                     for k in range(PASSES + 1):
                         started = clock()
@@ -135,6 +137,8 @@ def bench_edits(variant: str, size: int) -> Iterator[Row]:
             scene = load()
             for change in (_unchanged, turned, nearer, turned):
                 _timed(scene, change)  # compiles
+            scene = None
+            gc.collect()
             started = time.perf_counter()
             scene = load()
             _timed(scene, _unchanged)
