@@ -24,7 +24,7 @@ from halfspace_sss import Medium
 from halfspace_sss.physics.fresnel import F_r
 
 mi = pytest.importorskip("mitsuba")
-QUICK = {"seconds": 0.4, "flip": False, "exits": 64}
+QUICK = {"seconds": 0.2, "flip": False, "exits": 64}
 FEW = ["better_dipole", "lambert"]
 
 
@@ -81,7 +81,7 @@ def test_the_scene_is_as_it_was_after_an_assessment() -> None:
 
 
 def test_a_diffuse_surface_is_right_for_a_large_object_under_an_even_sky() -> None:
-    found = assess(scene({"sigma_s": 950, "sigma_a": 50}), models=["lambert"], **QUICK)
+    found = assess(scene({"sigma_s": 950, "sigma_a": 50}), models=["lambert"], **{**QUICK, "seconds": 0.4})
     row = found.objects[0].way("lambert")
     assert row.bias_bound < 0.15
     assert all(abs(r - 1) < 0.06 for r in row.ratio)
@@ -134,7 +134,7 @@ def test_without_light_every_way_shows_it_black() -> None:
     assert "no light comes from it, every technique shows it black" in str(found)
 
 
-QUICK_ASSESS = {"assess_seconds": 0.4, "exits": 64}
+QUICK_ASSESS = {"assess_seconds": 0.2, "exits": 64}
 
 
 def test_all_channels_of_exits_and_images_are_traced_once_and_by_one_kernel() -> None:
@@ -368,7 +368,7 @@ def test_denoised_walks_are_told_with_what_is_left_of_their_noise() -> None:
     lit = scene(light={"type": "envmap", "bitmap": mi.Bitmap(windows())})
     lit["sensor"]["film"]["rfilter"] = {"type": "box"}
     ways = [WALKS, PRECOMPUTED_WALKS, DENOISED_WALKS[1]]
-    found = assess_stage(stage(lit), ways, Effort(1.0, exits=64)).objects[0]
+    found = assess_stage(stage(lit), ways, Effort(0.5, exits=64)).objects[0]
     plain, row = (found.way(way.name) for way in ways[1:])
     assert row.variance == 0 and row.least >= 8 and samples_for(row, 10.0) == row.least
     assert max(plain.bias2, 0) - 4 * row.bias2_error < row.bias2 < plain.variance / row.least + 4 * row.bias2_error
