@@ -35,7 +35,7 @@ from halfspace_sss.neural.store import save_weights
 QUICKLY = Path.home() / ".drjit" / "of_tests"  # kernels that are compiled as below, apart from those of users
 # by CPU time, of fast and slow tests: begun first, so that no worker is left with one of them at the end
 LONGEST = (
-    "test_every_emitter", "test_any_place_and_unit", "test_page_commands", "test_unscattered_light",
+    "test_every_emitter", "test_any_place_and_unit", "test_page_commands", "test_correction", "test_unscattered_light",
     "test_fig_full_geometry", "test_full_scenes", "test_edits", "test_endings", "test_full_online", "test_flame",
     "test_rendering_gradients", "test_neural_reflectance", "test_full_training", "test_inside", "test_full_command",
     "test_trade_scenes", "test_gathered", "test_total_error", "test_full_varying", "test_full_contents",
