@@ -8,9 +8,9 @@ weighted least squares
 
 G a feature of points that C may follow, as light that was gathered there, W_cj = (1 - d² / h²)² max(n_c.n_j, 0)². The
 weight a keeps the sum of the residuals about each centre. The fits of all centres in reach are blended by the same
-weights W_cj. Before the levels, all residuals are fitted by (1, G) times cubic polynomials of the cosine: models are
-off alike everywhere. Level 0 is one fit of all points, each further level has four times as many centres as the
-one before and fits what the coarser ones leave. C is the first fit Z and what each level adds,
+weights W_cj. Before the levels, all residuals are fitted by (1, G) times cubic polynomials of the cosine: there models
+err alike everywhere. Level 0 is one fit of all points, each further level has four times as many centres as the one
+before and fits what the coarser ones leave. C is the first fit Z and what each level adds,
 
     C = Z + Σ_l kappa_l d^(l),    kappa_l = S[d_1 d_2] / S[(d_1 + d_2)² / 4],
 
