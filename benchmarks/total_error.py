@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import mitsuba as mi
 import numpy as np
@@ -34,6 +35,7 @@ from full_geometry.trade.denoising import Denoiser, cover
 
 SAMPLED, PRECOMPUTED = "walk, light sampled", "walk, light precomputed"
 MODEL, CORRECTED = "better_dipole", "better_dipole, light corrected"
+REFERENCE = "reference"
 PASSING = (*VOLUMES, SAMPLED, PRECOMPUTED)  # whose passes are independent
 BLOCK = 8  # pixels of its side
 REFERENCE_SPP = 64  # of a pass of the reference
@@ -58,17 +60,31 @@ class TotalErrors:
     seed: int = 0
 
 
+class Measured(NamedTuple):
+    """What total errors were measured.
+
+    Args:
+        table: a row for each case, way, time, raw and denoised.
+        images: of the first case after the middle time, by way with "raw" or "denoised", and REFERENCE.
+    """
+
+    table: pandas.DataFrame
+    images: dict[str, np.ndarray]
+
+
 def total_errors(
     cases: Sequence[LitObject], how: TotalErrors, folder: Path, progress: Callable[[str, int, int], None]
-) -> pandas.DataFrame:
-    """A row for each case, way, time, raw and denoised."""
+) -> Measured:
+    """Errors of all cases, ways and times."""
     prepare()
     folder.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
+    images: dict[str, np.ndarray] = {}
     for k, case in enumerate(cases):
         progress(f"{case.name}, {case.light}", k, len(cases))
-        rows += _measured(case, how, folder)
-    return pandas.DataFrame(rows)
+        found, seen = _measured(case, how, folder)
+        rows, images = rows + found, images or seen
+    return Measured(pandas.DataFrame(rows), images)
 
 
 def lit_scene(case: LitObject, way: str, size: int, folder: Path) -> mi.Scene | tuple[mi.Scene, ...]:
@@ -82,7 +98,7 @@ def lit_scene(case: LitObject, way: str, size: int, folder: Path) -> mi.Scene | 
     return load_scene(found, PATH_TRACED, settings={"light": kind, "layers": True})
 
 
-def _measured(case: LitObject, how: TotalErrors, folder: Path) -> list[Row]:
+def _measured(case: LitObject, how: TotalErrors, folder: Path) -> tuple[list[Row], dict[str, np.ndarray]]:
     scenes = {way: lit_scene(case, way, how.size, folder) for way in PASSING}
     inside = cover(scenes[SAMPLED]) > 0
     denoise = Denoiser(scenes[SAMPLED])
@@ -104,12 +120,14 @@ def _measured(case: LitObject, how: TotalErrors, folder: Path) -> list[Row]:
     best = min(costs[way] for way in VOLUMES)
 
     # ---- a row for each, raw and denoised
-    rows = []
+    rows, images, middle = [], {REFERENCE: R}, how.seconds[len(how.seconds) // 2]
     for (way, limit), average in found.items():
         clean = cross_denoised(average, denoise)
         raw = average.mean[..., :3], average.relative_error
         for name, (result, told) in (("raw", raw), ("denoised", (clean.image, clean.error))):
             pixels, blocks = (_error(result, R, noise, inside, size) for size in (1, BLOCK))
+            if limit == middle:
+                images[f"{way}, {name}"] = result
             mean = result[inside].mean(axis=0) / R[inside].mean(axis=0)
             rows.append(
                 {
@@ -119,7 +137,7 @@ def _measured(case: LitObject, how: TotalErrors, folder: Path) -> list[Row]:
                     "variance x time": best / costs[way] if name == "raw" and way in costs else np.nan,
                 }
             )  # fmt: skip
-    return rows
+    return rows, images
 
 
 def _averaged(images: np.ndarray, spp: int) -> Reference:

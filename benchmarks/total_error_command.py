@@ -70,10 +70,11 @@ def total_error_command(
     check_folder(out)
     with Bar("total error") as bar:
         how = TotalErrors(times, reference, size, seed)
-        table = total_errors(cases, how, out / "work", lambda what, k, n: bar.show(k, n, what))
+        measured = total_errors(cases, how, out / "work", lambda what, k, n: bar.show(k, n, what))
+    table = measured.table
     text = markdown(table.round(3))
     csv = table.to_csv(index=False, lineterminator="\n")
-    drawn = saved(draw(table))
+    drawn = saved(draw(measured))
     write_together(
         {out / "total_error.csv": csv, out / "total_error.md": text, out / "total_error.pdf": drawn["pdf"],
          out / "total_error.png": drawn["png"]}

@@ -1,10 +1,14 @@
-"""The figure of total error over seconds: a panel for each object and light, a curve for each technique."""
+"""The figure of total error over seconds: renders, and a panel for each object and light with a curve by technique."""
 
 from __future__ import annotations
 
+import numpy as np
 import pandas
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 
+from benchmarks.total_error import CORRECTED, PRECOMPUTED, REFERENCE, Measured
+from figures.computing.images import stops_of
+from full_geometry.trade.image_differences import srgb
 from halfspace_sss.comparison.style import paper
 
 # technique -> label, colour; a denoised image is dashed
@@ -15,17 +19,25 @@ CURVES = {
     "better_dipole, light corrected": ("better_dipole, corrected light", "#2e7d32"),
 }
 
+RENDERS = (
+    ("volpathmis", "volpathmis"), (PRECOMPUTED, "walk, precomputed light"), (CORRECTED, "corrected light"),
+    (REFERENCE, "reference"),
+)  # fmt: skip
 
-def draw(table: pandas.DataFrame) -> Figure:
-    """Error of pixels and of blocks over CPU seconds, log-log.
+
+def draw(measured: Measured) -> Figure:
+    """Renders of the first case after the middle time, and errors of pixels and of blocks over CPU seconds, log-log.
 
     Args:
-        table: of `total_error.total_errors`; of `volpathmis` the roulette depth with the smaller error is shown.
+        measured: by `total_error.total_errors`; of `volpathmis` the roulette depth with the smaller error is shown.
     """
+    table = measured.table
     cases = list(table.groupby(["object", "light"], sort=False))
     with paper():
-        figure = Figure(figsize=(2.3 * len(cases), 4.2), layout="constrained")
-        axes = figure.subplots(2, len(cases), sharex=True, sharey="row", squeeze=False)
+        figure = Figure(figsize=(max(2.3 * len(cases), 4.6), 5.6), layout="constrained")
+        above, below = figure.subfigures(2, 1, height_ratios=(1.25, 4.2))
+        _draw_renders(above, measured)
+        axes = below.subplots(2, len(cases), sharex=True, sharey="row", squeeze=False)
         for column, ((name, light), rows) in enumerate(cases):
             for row, what in enumerate(("pixels, %", "blocks, %")):
                 ax = axes[row][column]
@@ -42,8 +54,26 @@ def draw(table: pandas.DataFrame) -> Figure:
             axes[1][column].set_xlabel("CPU seconds")
         axes[0][0].set_ylabel("error of pixels, %")
         axes[1][0].set_ylabel("error of 8 x 8 blocks, %")
-        figure.legend(loc="outside lower center", ncols=3, fontsize=7)
+        below.legend(loc="outside lower center", ncols=3, fontsize=7)
     return figure
+
+
+def _draw_renders(figure: SubFigure, measured: Measured) -> None:
+    """Techniques side by side with the error of their pixels, and the reference, exposed alike."""
+    rows = measured.table.groupby(["object", "light"], sort=False).get_group(tuple(measured.table.iloc[0][:2]))
+    times = sorted(set(rows["seconds"]))
+    middle = times[len(times) // 2]
+    rows = rows[rows["seconds"] == middle].set_index("way")["pixels, %"]
+    reference = measured.images[REFERENCE]
+    inside = reference.sum(axis=2) > 0
+    stops = stops_of(reference, inside)
+    box = tuple(slice(int(at.min()), int(at.max()) + 1) for at in np.nonzero(inside))
+    for ax, (technique, label) in zip(figure.subplots(1, 4), RENDERS):
+        way = rows[rows.index.str.startswith(technique)].idxmin() if technique != REFERENCE else technique
+        ax.imshow(srgb(np.maximum(measured.images[way][box], 0), stops), interpolation="nearest")
+        error = f"\n{way.rpartition(', ')[2]}, {middle:g} s: {rows[way]:.1f} %" if way in rows.index else "\n"
+        ax.set_title(label + error, fontsize=7)
+        ax.set_axis_off()
 
 
 def _curve(rows: pandas.DataFrame, technique: str, kind: str, what: str) -> pandas.Series:

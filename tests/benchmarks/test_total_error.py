@@ -70,7 +70,8 @@ def test_precomputed_light_comes_nearer_to_the_reference_in_more_time(
         return kept[0]
 
     monkeypatch.setattr(module, "_corrected", once)
-    table = module.total_errors([LitObject("hand of potato", "windows")], how, tmp_path, lambda *about: None)
+    table, images = module.total_errors([LitObject("hand of potato", "windows")], how, tmp_path, lambda *about: None)
+    assert len(images) == 2 * len(module.PASSING) + 3
     found, corrected = (
         table[table["way"] == f"{way}, raw"] for way in ("walk, light precomputed", "better_dipole, light corrected")
     )
