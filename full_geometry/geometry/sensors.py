@@ -52,18 +52,22 @@ def seeded_sampler(sensor: mi.Sensor, spp: int, seed: int) -> mi.Sampler:
     return sampler
 
 
-def rays_by(sensor: mi.Sensor, sampler: mi.Sampler) -> tuple[mi.Ray3f, mi.Spectrum, mi.Vector2f]:
+def rays_by(
+    sensor: mi.Sensor, sampler: mi.Sampler, pixels: mi.UInt32 | None = None
+) -> tuple[mi.Ray3f, mi.Spectrum, mi.Vector2f]:
     """Rays of all samples of each pixel, their weights, and their positions on the film.
 
     Args:
         sensor: its film has been prepared.
         sampler: with a lane for each ray, pixel by pixel.
+        pixels: numbers of the pixels; all where None.
     """
     spp = sampler.sample_count()
     film, size = sensor.film(), sampled_size(sensor.film())
     border = film.rfilter().border_size() if film.sample_border() else 0
-    n = int(dr.prod(size)) * spp
+    n = (int(dr.prod(size)) if pixels is None else dr.width(pixels)) * spp
     index, width = dr.arange(mi.UInt32, n) // dr.opaque(mi.UInt32, spp), dr.opaque(mi.UInt32, int(size[0]))
+    index = index if pixels is None else dr.gather(mi.UInt32, pixels, index)
     first, scale = film.crop_offset() - border, 1 / mi.ScalarVector2f(film.crop_size())
     offset = -mi.ScalarVector2f(film.crop_offset()) * scale
     first, scale, offset = (mi.Vector2i(first), mi.Vector2f(scale), mi.Vector2f(offset))

@@ -5,15 +5,18 @@ from __future__ import annotations
 import contextlib
 import functools
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
+from scipy.ndimage import uniform_filter
 
-from full_geometry.geometry.sensors import camera_rays, checked_samples, sampled_size, splat, widened
+from full_geometry.geometry.sensors import checked_samples, path_numbers, rays_by, sampled_size, seeded, splat, widened
 from full_geometry.geometry.shape import SceneMark
 from full_geometry.geometry.snapshot import Snapshot, same_objects
-from full_geometry.integrators.bssrdf import undisturbed
+from full_geometry.integrators.bssrdf import Launch, is_independent, undisturbed
 from full_geometry.integrators.gathering import light_state
 from full_geometry.integrators.walk_paths import FirstExits, LightVisitor, PathTracer
 from full_geometry.objects.inclusions import check_sensors
@@ -41,6 +44,8 @@ from halfspace_sss.interrupts import checkpoint, interruptible
 
 PARAMETERS = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters", "connection_share", "blur", "light", "layers")
 SAMPLES_PER_LAUNCH = 2**19
+GLINT, GLINTS, PLACES = 8.0, 128, 8  # least variance over the light, one of so many pixels at most, places in each
+TRIALS, LIT_RAYS = 16, 2**13  # most rays through each pixel that find them; rays that tell the light
 LAYER = ["emission.R", "emission.G", "emission.B"]
 SAMPLES_PER_RAY = 4  # of the image, for each ray of light: these take a tenth of the time or less
 SAMPLES_PER_PATH = 8  # the same for each path of scattered light, which takes as long as a few samples
@@ -72,7 +77,7 @@ def _class(variant: str) -> type:
         "sampled" meets it by chance and by connections, without that bias; "auto" precomputes it where that is
         possible and there is more than an even sky, and samples it for derivatives), `layers` (false; true adds the
         channels emission.R, .G and .B to the image: emitters that the camera sees at once and, with precomputed light,
-        in the mirror of an object, which leaves what is behind it for a denoiser).
+        in the mirror of an object and straight through it, which leaves the rest for a denoiser).
         """
 
         def __init__(self, props: mi.Properties) -> None:
@@ -336,18 +341,23 @@ def _render(
         if inside.spectral is not None:
             inside.spectral.check_covers(obj.name, sensor)
     sensor.film().prepare(LAYER if tracer.layers else [])
+    glints = _glints(tracer, sensor, seed, spp)
     # launches are so small that their arrays fit, and that an interrupt is heard between them
     most = max(1, on_device(SAMPLES_PER_LAUNCH) // int(dr.prod(sampled_size(sensor.film()))))
-    for launch, start in enumerate(range(0, spp, most)):
+    for number, start in enumerate(range(0, spp, most)):
         checkpoint()
-        _launch(tracer, sensor, min(most, spp - start), (seed, launch), keep, scored)
+        _launch(tracer, sensor, Launch(start, min(most, spp - start)), (seed, number), keep, scored, glints)
 
 
 def _launch(
-    tracer: PathTracer, sensor: mi.Sensor, spp: int, seed: tuple[int, int], keep: Keep | None, scored: bool
-) -> None:
-    """Trace spp rays through each pixel and add them to the film, with derivatives if `scored`."""
-    rays, weight, position = camera_rays(sensor, spp, seed)
+    tracer: PathTracer, sensor: mi.Sensor, launch: Launch, seed: tuple[int, int], keep: Keep | None, scored: bool,
+    glints: mi.UInt32 | None = None,
+) -> None:  # fmt: skip
+    """Trace the rays of a launch and add them to the film, with derivatives if `scored`."""
+    # numbers of low discrepancy go on from launch to launch
+    sampler = launch.sampler(sensor, seeded(*(seed[:1] if is_independent(sensor.sampler()) else seed)))
+    rays, weight, position = rays_by(sensor, sampler)
+    spp = sampler.sample_count()
     rays = tracer.shown(rays)
 
     # ---- with derivatives: L + sum of scores times parameters, whose derivative is that of the mean
@@ -362,11 +372,62 @@ def _launch(
 
     # ---- without, and with the layer of emission
     exits = FirstExits.of(tracer.visitor.scene, tracer.visitor.media, rays) if keep else None
+    if glints is not None:
+        apart = dr.full(mi.Bool, False, dr.width(rays))
+        if dr.width(glints):
+            lanes = dr.arange(mi.UInt32, dr.width(glints) * spp)
+            lanes = dr.gather(mi.UInt32, glints, lanes // spp) * spp + lanes % spp
+            dr.scatter(apart, True, lanes)
+        dr.eval(apart)
+        tracer = replace(tracer, apart=apart)
     L, seen, emission = tracer.trace(rays, on_device(PATH_LANES), seed, exits)
     if keep:
         keep(exits)
-    layer = list(mi.Color3f(weight * emission)) if tracer.layers else []
-    splat(sensor.film(), rays, weight * L, seen, position, spp, layer)
+    L, emission = weight * L, weight * emission
+
+    # ---- in some pixels, emission in mirrors at many more places
+    if glints is not None and dr.width(glints):
+        numbers = path_numbers(seeded(seed[0], 1), dr.width(glints), launch.first * PLACES, spp * PLACES)
+        places, weight, _ = rays_by(sensor, numbers, glints)
+        found = weight * tracer.seen_emission(tracer.shown(places))
+        found = mi.Spectrum([dr.block_sum(v, PLACES) / PLACES for v in found])
+        for target in (L, emission) if tracer.layers else (L,):
+            dr.eval(target)
+            dr.scatter_add(target, found, lanes)
+    splat(sensor.film(), rays, L, seen, position, spp, list(mi.Color3f(emission)) if tracer.layers else [])
+
+
+def _glints(tracer: PathTracer, sensor: mi.Sensor, seed: int, spp: int) -> mi.UInt32 | None:
+    """Pixels in which emission seen in objects varies much more than other light; None where it is met by chance.
+
+    Only of box filters, which do not ask where in a pixel light is.
+    """
+    film = sensor.film()
+    if tracer.visitor.unscattered is None or not film.rfilter().is_box_filter():
+        return None
+
+    # ---- the mean square of other light
+    width, height = (int(v) for v in sampled_size(film))
+    pixels = mi.UInt32(np.linspace(0, width * height - 1, LIT_RAYS).astype(np.uint32))
+    rays, weight, _ = rays_by(sensor, path_numbers(seeded(seed, 2), LIT_RAYS, 0, 1), pixels)
+    apart = dr.full(mi.Bool, True, LIT_RAYS)
+    dr.eval(apart)
+    L, hit, _ = replace(tracer, apart=apart).trace(tracer.shown(rays), on_device(PATH_LANES), (seed, 2))
+    light = np.array(weight * L, dtype=float)[:, np.array(hit)]
+    least = GLINT * float((light**2).sum() / max(light.shape[1], 1))
+
+    # ---- the variance of that emission over a pixel and its neighbours, by more rays where one in each has found some
+    for trial in (1, max(1, min(spp // 8, TRIALS))):
+        numbers = path_numbers(seeded(seed, 3, trial), width * height, 0, trial)
+        rays, weight, _ = rays_by(sensor, numbers)
+        found = np.array(weight * tracer.seen_emission(tracer.shown(rays)), dtype=float)
+        found = found.reshape(-1, height, width, trial)
+        squares, means = (uniform_filter(v.mean(axis=3), (0, 3, 3)) for v in (found**2, found))
+        variance = (squares - means**2).sum(axis=0).ravel()
+        number = min(int(np.count_nonzero(variance > least)), len(variance) // GLINTS)
+        if number == 0:
+            break
+    return mi.UInt32(np.sort(np.argsort(variance)[len(variance) - number :]).astype(np.uint32))
 
 
 def _scale(name: str, value: float) -> float:

@@ -38,8 +38,8 @@ from full_geometry.walk.random_walk import (
     Visitor,
     Walk,
     Walker,
-    below,
     draw,
+    draw_channel,
     eval_phase,
     sample_bsdf,
     start_walk,
@@ -47,6 +47,9 @@ from full_geometry.walk.random_walk import (
 from full_geometry.walk.scores import PathScores, Score, ScoreVisitor, Stay, StayRecord
 from full_geometry.walk.straight_light import StraightLight
 from halfspace_sss.tracing.walk import generator, pass_seed
+
+MIRRORS = 2  # of objects, one in the other, in which the first surface of a path finds emission
+LEAST_SEEN = 1e-3  # transmittance, below which emission behind an object is left to chance
 
 # ---- Loop state ------------------------------------------------------------------------------------------------------
 
@@ -66,10 +69,24 @@ class LightRecord:
     departure: Departure  # from the last event
     sighted: mi.Bool  # an emitter was sampled at the last event, and only boundaries of index 1 were passed since
     scattered: mi.Bool  # whether a vertex has scattered into a solid angle: delta lights then are no longer hidden
-    precomputed: mi.Bool  # the ray's emission is in the unscattered light of the last event, or in the mirror image
+    precomputed: mi.Bool  # the ray's emission is in the light of the last event, in the mirror image, or seen through
     known: mi.Bool  # light that comes by objects alone has been found precomputed
     slopes: Score | tuple[()] = ()  # where derivatives are asked for, see `walk.scores`
     run: ForwardRun | tuple[()] = ()  # where precomputed light has met forward events
+
+
+class Seen(NamedTuple):
+    """Emission that is found without chance along one way from a boundary.
+
+    Args:
+        light: of that way, with the throughput.
+        found: whether it is found.
+        kept: probability that a path does not take that way; 1 where it may meet surfaces there.
+    """
+
+    light: mi.Spectrum
+    found: mi.Bool
+    kept: mi.Spectrum
 
 
 class Behind(NamedTuple):
@@ -106,6 +123,7 @@ class CameraPath:
     light: LightRecord  # what it has gathered
     hit: mi.Bool  # whether its first ray hit anything
     depth: mi.UInt32  # vertices on surfaces met from outside
+    mirrored: mi.Bool  # whether it has met mirrors of objects alone, all from outside
     stay: Stay | tuple[()] = ()  # inside an object, where derivatives are asked for
     emission: mi.Spectrum | tuple[()] = ()  # seen at once or in the mirror of what is met first, if asked for
 
@@ -154,7 +172,7 @@ class LightVisitor:
                 return self._all_light(walk, record, event)
             L = walk.weight * self.unscattered.light(self.media, event)[0]
             if self.forward:
-                share = dr.select(record.precomputed, record.run.onward(event.along).share, 1)
+                share = dr.select(record.precomputed & (walk.order > 0), record.run.onward(event.along).share, 1)
                 run = ForwardRun(share, mi.Vector3f(event.along), mi.Spectrum(event.m.g), mi.Bool(True))
                 record = replace(record, run=run)
             return walk, replace(record, L=record.L + dr.select(counts, L, 0), precomputed=mi.Bool(True))
@@ -256,6 +274,8 @@ class LightVisitor:
         # ---- the last vertex is the boundary, with the density of the direction that leaves it
         before = record
         record = replace(record, previous=crossing.si.p, pdf=crossing.pdf, delta=crossing.delta)
+        if self.unscattered is not None:  # `emitter_behind` knows no reflections
+            record = replace(record, precomputed=record.precomputed & (crossing.leaves | (walk.order > 0)))
         if self.forward:
             record = replace(record, run=record.run.onward(crossing.along))
 
@@ -312,22 +332,81 @@ class LightVisitor:
             _, _, _, weight, _ = dr.if_stmt(state, directed, self._against_directions, lambda *state: state)
         return walk.weight * left * emission(emitter, si, weight, active)
 
-    def mirrored_emitter(
-        self, walk: Walk, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool
-    ) -> mi.Spectrum:
-        """Light of the emitter that a smooth boundary mirrors, F L, which no random choice of reflection then meets."""
-        # the mirrored direction with its reflectance F
+    @property
+    def sees_through(self) -> bool:
+        """Whether emitters behind objects are found without chance, `emitter_behind`."""
+        light = self.unscattered
+        return light is not None and light.thin and not (self.media.varies or self.media.carried)
+
+    def seen_emitters(
+        self, walk: Walk, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32, active: mi.Bool, through: mi.Bool
+    ) -> tuple[Seen, Seen]:
+        """What object k mirrors, and what is seen through it; added whatever is chosen, it must not count again.
+
+        Only where light inside is precomputed: beside light that is met by chance, of an even sky above all, the choice
+        between both sides of the boundary has less noise.
+
+        Args:
+            active: whether emitters are looked for.
+            through: the same behind the object; where a path has scattered, the cones of delta lights are met there.
+        """
+        none = Seen(mi.Spectrum(0), mi.Bool(False), mi.Spectrum(1))
+        if self.unscattered is None:
+            return none, none
+        smooth = ~self.media.row("rough", k)
+        behind = self.emitter_behind(walk, si, k, smooth & through) if self.sees_through else none
+        return self.mirrored_emitter(walk, si, bsdf, smooth & active), behind
+
+    def mirrored_emitter(self, walk: Walk, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool) -> Seen:
+        """What a smooth boundary mirrors, which no random choice of reflection then meets: F L_e, and 1 - F."""
+        # the mirrored direction with its reflectance F, and L_e there
         ctx = mi.BSDFContext()
         ctx.type_mask = mi.BSDFFlags.DeltaReflection
         bs, value = bsdf.sample(ctx, si, 0.0, mi.Point2f(0), active)
         d, _ = sided(si, bs.wo)
+        L_e, nothing = self._emission_along(si, d, active & (bs.pdf > 0))
+        return Seen(walk.weight * value * L_e, active, dr.select(nothing, 1 - value, 1))
 
-        # throughput F L_e of what it meets
+    def emitter_behind(self, walk: Walk, si: mi.SurfaceInteraction3f, k: mi.Int32, active: mi.Bool) -> Seen:
+        """What is seen through object k without reflection inside, which no free flight then meets.
+
+        The light is (1 - F) T (1 - F') L_e, F of the boundary and F' of that on the other side, and what flights keep
+        1 - T (1 - F').
+        """
+        # ---- the refracted direction with 1 - F, and the boundary on its way
+        media, ctx = self.media, mi.BSDFContext()
+        ctx.type_mask = mi.BSDFFlags.DeltaTransmission
+        bs, value = media.boundary(k).sample(ctx, si, 0.0, mi.Point2f(0), active)
+        d, _ = sided(si, bs.wo)
+        active = active & (bs.pdf > 0) & (dr.dot(d, si.n) < 0)
+        o, off = media.depart(si, d, mi.Bool(True))
+        ray = mi.Ray3f(o + off, d)
+        hit = media.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+        out = media.instance_scene.interaction(hit, ray, media.needed)
+        active = active & hit.is_valid() & (media.met(out, k) == k)
+        out = media.seen(out, k, d)
+        active = active & (dr.dot(out.n, d) > 0)
+
+        # ---- T (1 - F') at that boundary, and L_e of what is met beyond
+        T = media.transmittance(k, ray, dr.maximum(hit.t + dr.dot(off, d), 0), walk.rng)
+        active = active & (dr.max(T) > LEAST_SEEN)
+        bs, leaves = media.boundary(k).sample(ctx, out, 0.0, mi.Point2f(0), active)
+        d, _ = sided(out, bs.wo)
+        leaving = active & (bs.pdf > 0) & (dr.dot(d, out.n) > 0)
+        L_e, nothing = self._emission_along(out, d, leaving)
+        passed = dr.select(leaving, T * leaves * dr.square(bs.eta), 0)
+        light = dr.select(leaving, walk.weight * value * T * leaves * L_e, 0)
+        return Seen(light, active, dr.select(nothing, 1 - passed, 1))
+
+    def _emission_along(
+        self, si: mi.SurfaceInteraction3f, d: mi.Vector3f, active: mi.Bool
+    ) -> tuple[mi.Spectrum, mi.Bool]:
+        """Radiance of the emitter that a ray from a surface meets, and whether it meets no surface."""
         ray = ray_from(si, d, self.media.instance_scene.rounding(si))
         met = self.media.instance_scene.intersect(self.scene, ray, mi.RayFlags.All, active=active)
         emitter = met.emitter(self.scene, active)
-        active = active & (emitter != None) & (bs.pdf > 0)  # noqa: E711
-        return dr.select(active, walk.weight * value * emitter.eval(met, active), 0)
+        found = active & (emitter != None)  # noqa: E711
+        return dr.select(found, emitter.eval(met, found), 0), active & ~met.is_valid()
 
     def _against_directions(
         self, which: mi.Int32, departure: Departure, medium: WalkMedium, share: mi.Float, directed: mi.Bool
@@ -428,6 +507,7 @@ class PathTracer:
         layers: whether emission that the camera sees, at once or in the mirror of an object, is also told apart.
         begins_inside: whether the object that a path meets first does not reflect it, but lets it in or ends it.
         passes: whether light that passes the first object unscattered counts.
+        apart: by the number of a ray, whether light is without its `seen_emission`.
     """
 
     visitor: LightVisitor
@@ -437,6 +517,7 @@ class PathTracer:
     layers: bool = False
     begins_inside: bool = False
     passes: bool = True
+    apart: mi.Bool | None = None
 
     @property
     def begins_at(self) -> mi.UInt32:
@@ -468,6 +549,8 @@ class PathTracer:
 
         def begin(index: mi.UInt32, rng: mi.PCG32) -> CameraPath:
             path = _begin(rays, total, index, rng, media, bool(scores), self.visitor.forward)
+            if self.visitor.sees_through and exits is None:  # of all orders, the lowest too
+                path.walk.kept = dr.full(mi.Spectrum, 1, dr.width(index))
             return replace(path, emission=dr.zeros(mi.Spectrum, dr.width(index))) if self.layers else path
 
         # inside: a free flight, with what is recorded beside the light
@@ -511,6 +594,31 @@ class PathTracer:
         """The rays of a camera, which begin behind emitters that it does not see."""
         scene, instance_scene = self.visitor.scene, self.visitor.media.instance_scene
         return past_emitters(scene, instance_scene, rays) if self.hide_emitters else rays
+
+    def seen_emission(self, rays: mi.Ray3f) -> mi.Spectrum:
+        """Emission that rays see in the mirror of the object that they meet first, and behind it: a part of `trace`."""
+        walk = start_walk(rays.o, rays.d, generator(mi, dr.width(rays), pass_seed(0)))
+        if self.begins_inside:
+            return dr.zeros(mi.Spectrum, dr.width(rays))
+        return self._mirrored(walk, dr.full(mi.Bool, True, dr.width(rays)), MIRRORS)
+
+    def _mirrored(self, walk: Walk, active: mi.Bool, levels: int) -> mi.Spectrum:
+        """Emission in the mirrors of objects that a way along mirrored directions meets, and behind them."""
+        media, L = self.visitor.media, mi.Spectrum(0)
+        for level in range(levels):
+            # ---- emission seen at the surface
+            ray = mi.Ray3f(walk.o, walk.d)
+            si = media.instance_scene.intersect(self.visitor.scene, ray, mi.RayFlags.All, active=active)
+            k = media.index_of(si, si.is_valid())
+            near = dr.maximum(k, 0)
+            si = media.seen(si, k, walk.d)
+            active = active & (k >= 0) & media.row("reflects", near)
+            boundary = media.boundary_pointer(near)
+            mirrored, behind = self.visitor.seen_emitters(walk, si, boundary, near, active, active)
+            L = L + mirrored.light + behind.light
+            if level + 1 < levels:
+                walk, active = _along_mirror(media, walk, si, boundary, mirrored.found)
+        return L
 
     def _outside(self, p: CameraPath) -> CameraPath:
         """A ray outside all objects, and the surface that it meets."""
@@ -582,15 +690,15 @@ class PathTracer:
         outer = translucent if behind is None else translucent | behind.member
         L = light.L + self.visitor.sampled_emitter(walk, si, bsdf, lit, outer)
 
-        # ---- emitters in the mirror of a smooth boundary: F L(mirrored direction)
-        mirrors, L, p = self._mirror(L, p, si, bsdf, near, translucent & lit)
+        # ---- emitters in the mirror of a smooth boundary, and behind it: F L_e, (1 - F) T (1 - F') L_e
+        mirrored, seen, L, p = self._seen(L, p, si, bsdf, near, translucent & lit)
 
-        # ---- BSDF sampling: throughput *= f cos / p_f
-        bs, value = sample_bsdf(bsdf, si, rng)
+        # ---- BSDF sampling: throughput *= f cos / p_f, by refraction alone where all that is mirrored is known
+        bs, value = sample_bsdf(bsdf, si, rng, refracts=dr.max(mirrored.kept) < 1)
         d, turned = sided(si, bs.wo)
         d, turned = dr.select(translucent, d, si.to_world(bs.wo)), turned & translucent
         enters = translucent & (dr.dot(d, si.n) < 0)
-        weight, scale = walk.weight * value, walk.scale * dr.square(bs.eta)
+        weight, scale = walk.weight * value * mirrored.kept, walk.scale * dr.square(bs.eta)
 
         # ---- Russian roulette: survive with q = min(size, 0.95), throughput /= q
         size = dr.max(weight) * scale
@@ -599,9 +707,7 @@ class PathTracer:
         alive = (bs.pdf > 0) & (size > 0) & (rng.next_float32() < survive) & ~(mute & ~enters)
 
         # ---- the way on, or into an object
-        u, channel = rng.next_float32(), walk.channel
-        if len(weight) > 1:  # drawn once in a path, whose densities are counted from there
-            channel = dr.select(p.depth == 1, below(len(weight), u), channel)
+        channel, density = self._channel(p, near, rng.next_float32())
         if behind is not None:
             through = behind.member & (dr.dot(d, si.n) * dr.dot(walk.d, si.n) > 0)
             walk, k, enters = behind.entered(walk, through, k, enters)
@@ -610,7 +716,8 @@ class PathTracer:
             new = alive & enters
             walk = replace(walk, medium=dr.select(new, media.fetch(dr.maximum(k, 0), si, new), walk.medium))
         walk = replace(walk, o=o, d=d, off=off, alive=alive, order=dr.select(enters, 0, walk.order), channel=channel,
-                       object=dr.select(alive & enters, k, OUTSIDE), weight=weight, scale=scale)  # fmt: skip
+                       density=density, object=dr.select(alive & enters, k, OUTSIDE), weight=weight, scale=scale,
+                       kept=dr.select(enters, seen.kept, 1) if len(walk.kept) else ())  # fmt: skip
 
         # ---- the last vertex for the MIS weight of emission; index 1 keeps the event
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | turned
@@ -620,29 +727,61 @@ class PathTracer:
             again = light.sighted & enters & same & self.visitor.straight_light.passes_again(near)
         light = replace(light, L=L, previous=dr.select(again, light.previous, si.p), sighted=again,
                         pdf=dr.select(again, light.pdf, bs.pdf), delta=delta & ~again, scattered=scattered,
-                        precomputed=mirrors & ~enters, run=light.run and light.run.ended())  # fmt: skip
+                        precomputed=dr.select(enters, seen.found, mirrored.found),
+                        run=light.run and light.run.ended())  # fmt: skip
         if behind is not None:
             L = L + self.visitor.spread_inner_lights(walk, scattered & enters)
             light = replace(light, delta=~again & (delta | enters | through | behind.unlit), L=L)
-        return replace(p, walk=walk, light=light)
+        return replace(p, walk=walk, light=light, mirrored=p.mirrored & mirrored.found & ~enters)
 
-    def _mirror(
+    def _channel(self, p: CameraPath, k: mi.Int32, u: mi.Float) -> tuple[mi.UInt32, mi.Spectrum]:
+        """The channel by which a path draws, once at its first surface, and its q from there."""
+        known = p.walk.channel, p.walk.density
+        n = len(p.walk.weight)
+        if n == 1:
+            return known
+        # light by chance has rare bright paths, which are the noise of dark channels too
+        shares = mi.Spectrum(1 / n) if self.visitor.unscattered is None else self.visitor.media.shares(k)
+        return dr.select(p.depth == 1, draw_channel(shares, u), known)
+
+    def _seen(
         self, L: mi.Spectrum, p: CameraPath, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32, active: mi.Bool
-    ) -> tuple[mi.Bool, mi.Spectrum, CameraPath]:
-        """Whether object k mirrors, and the light with the emission it mirrors, at the first vertex also told apart.
+    ) -> tuple[Seen, Seen, mi.Spectrum, CameraPath]:
+        """What object k mirrors, and what is seen through it, and the light with both, at first told apart."""
+        small = self.visitor.small
+        through = active & ~p.light.scattered if small is not None and small.n_delta else active
+        if not self.passes:
+            through = through & (p.depth > 1)
+        mirrored, behind = self.visitor.seen_emitters(p.walk, si, bsdf, k, active, through)
+        light, first = mirrored.light + behind.light, p.depth == 1
 
-        Only where light inside is precomputed: beside light that is met by chance, of an even sky above all, the choice
-        between both sides of the boundary has less noise.
-        """
-        media = self.visitor.media
-        if self.visitor.unscattered is None:
-            return mi.Bool(False), L, p
-        # F L_e is added whatever is chosen, so that the reflected ray must not count emission again
-        mirrors = active & ~media.row("rough", k)
-        L_e = self.visitor.mirrored_emitter(p.walk, si, bsdf, mirrors)
+        # ---- the first surface finds what mirrors show in its mirror, so that they must not
+        if self.visitor.unscattered is not None:
+            meets = first & mirrored.found & (dr.min(mirrored.kept) == 1)
+            walk, meets = _along_mirror(self.visitor.media, p.walk, si, bsdf, meets)
+            state = (light, walk, meets)
+            light, _, _ = dr.if_stmt(state, meets, self._in_mirror, lambda *state: state, label="mirrors")
+            light = dr.select(p.mirrored & ~first & (p.depth <= MIRRORS), 0, light)
+        if self.apart is not None:
+            light = dr.select(first & dr.gather(mi.Bool, self.apart, p.index), 0, light)
         if self.layers:
-            p = replace(p, emission=p.emission + dr.select(p.depth == 1, L_e, 0))
-        return mirrors, L + L_e, p
+            p = replace(p, emission=p.emission + dr.select(first, light, 0))
+        return mirrored, behind, L + light, p
+
+    def _in_mirror(self, light: mi.Spectrum, walk: Walk, active: mi.Bool) -> tuple:
+        return light + self._mirrored(walk, active, MIRRORS - 1), walk, active
+
+
+def _along_mirror(
+    media: WalkMedia, walk: Walk, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool
+) -> tuple[Walk, mi.Bool]:
+    """The way on along the direction that a smooth boundary mirrors, with the reflectance as throughput."""
+    ctx = mi.BSDFContext()
+    ctx.type_mask = mi.BSDFFlags.DeltaReflection
+    bs, value = bsdf.sample(ctx, si, 0.0, mi.Point2f(0), active)
+    d, _ = sided(si, bs.wo)
+    o, _ = media.depart(si, d, mi.Bool(False))
+    return replace(walk, o=o, d=d, weight=walk.weight * value), active & (bs.pdf > 0)
 
 
 def _same(p: CameraPath) -> CameraPath:
@@ -667,7 +806,8 @@ def _begin(
     if media.overlaps:
         walk.within = dr.full(mi.UInt32, 0, lanes)
     stay = Stay.none(lanes, media.textured) if scored else ()
-    return CameraPath(index, walk, start_record(lanes, scored, forward), no, first, stay)
+    yes = dr.full(mi.Bool, True, lanes)
+    return CameraPath(index, walk, start_record(lanes, scored, forward), no, first, yes, stay)
 
 
 # ---- First exits of paths from the camera ------------------------------------------------------------------------

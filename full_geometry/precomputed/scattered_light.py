@@ -34,7 +34,7 @@ from full_geometry.walk.random_walk import (
     Event,
     Walk,
     Walker,
-    below,
+    draw_channel,
     on_device,
     sample_bsdf,
     start_walk,
@@ -113,7 +113,7 @@ class ScatteredLight:
     def _trace(self, starts: tuple, seed: tuple[int, ...]) -> None:
         """Walk from so many starts; lanes take those of index, index + lanes, ... until none is left."""
         dr.eval(starts)
-        number, n = dr.width(starts[0]), len(mi.Spectrum(0))
+        number = dr.width(starts[0])
         lanes = min(on_device(PATH_LANES), number)
         total, step = (dr.opaque(mi.UInt32, v) for v in (number, lanes))
         walker = Walker(self.media, self)
@@ -121,8 +121,9 @@ class ScatteredLight:
         def begin(index: mi.UInt32, rng: mi.PCG32) -> tuple[Walk, LightPath]:
             known = index < total
             o, d, off, k, alive, path = (dr.gather(type(v), v, index, known) for v in starts)
-            channel = below(n, rng.next_float32())
-            return replace(start_walk(o, d, rng), off=off, object=k, alive=alive & known, channel=channel), path
+            channel, density = draw_channel(self.media.shares(dr.maximum(k, 0)), rng.next_float32())
+            walk = replace(start_walk(o, d, rng), off=off, object=k, alive=alive & known)
+            return replace(walk, channel=channel, density=density), path
 
         def renew(walk: Walk, index: mi.UInt32, path: LightPath) -> tuple[Walk, mi.UInt32, LightPath]:
             walk, path = begin(index + step, walk.rng)

@@ -58,6 +58,7 @@ FEWEST_POINTS, MOST_POINTS = 2**14, 2**18  # of the surface that find its cells,
 MOST_INTEGER = 2**15 - 1  # of 16 bits, for a direction of 1
 MOST_TRUNCATED = 0.5  # abs(g) of media that vary or have textures, above which three coefficients are too few
 FEWEST_PATHS = 2**14  # of scattered light, from each object
+THIN = 8.0
 ROULETTE = 0.1  # part of its light below which a reflected ray may end
 
 
@@ -74,6 +75,7 @@ class UnscatteredLight:
             None where that is left to walks.
         tables: by the number of an object, where its bricks begin, their corner, 1/h and counts.
         forward: whether it has met forward events, see `forward_scattering`.
+        thin: whether an object is so few mean free paths wide that emitters shine through it.
     """
 
     index: CellIndex
@@ -81,6 +83,7 @@ class UnscatteredLight:
     directions: mi.UInt32 | None
     tables: dict[str, Any]
     forward: bool
+    thin: bool = False
     scattered: mi.Float | None = None
 
     def light(self, media: WalkMedia, event: Event, last: mi.Bool | bool = False) -> tuple[mi.Spectrum, mi.Bool]:
@@ -163,7 +166,7 @@ def unscattered_light(
     index = CellIndex(_joined(bricks), _joined(slots))
     light = _joined(fluence), _joined(directions) if directional else None
     dr.make_opaque(tables, index, light)
-    found = UnscatteredLight(index, *light, tables, forward(media))
+    found = UnscatteredLight(index, *light, tables, forward(media), any(_thin(media, k) for k in range(len(cells))))
     if paths:
         found = replace(found, scattered=_scattered(scene, media, seed, found, cells, paths))
     dr.sync_thread()  # callers time this
@@ -268,6 +271,12 @@ def _grid(media: WalkMedia, k: int) -> tuple[tuple[np.ndarray, np.ndarray], floa
     fine = max(4 * volume / (area * ACROSS), (volume / FINE_CELLS) ** (1 / 3))
     h = min(edge / float(np.mean(extinction)), fine or np.inf)
     return box, cell_edge(box, (area, volume), h, depths), depths
+
+
+def _thin(media: WalkMedia, k: int) -> bool:
+    """Whether the mean chord of object k, 4 V / A, is below THIN mean free paths."""
+    area, volume = _extent(media, k)
+    return 4 * volume / area * float(np.min(_extinction(media, media.instance_table.kind[k]))) < THIN
 
 
 def _extent(media: WalkMedia, k: int) -> tuple[float, float]:

@@ -262,6 +262,17 @@ def per_channel(rows: list[float | np.ndarray], scale: float) -> list[mi.Float]:
     return [mi.Float(values[:, c].tolist()) for c in range(n)] if len(rows) else []
 
 
+def _shares(medium: Medium) -> np.ndarray:
+    """Probability of each channel of a walk: a part evenly, the rest by the light that a half-space sends back.
+
+    About (1 - s) (1 - 0.139 s) / (1 + 1.17 s) of it, s² = (1 - a) / (1 - a g) for the albedo a (van de Hulst 1980).
+    """
+    albedo = np.atleast_1d(medium.albedo).astype(float)
+    s = np.sqrt((1 - albedo) / np.maximum(1 - albedo * medium.g, 1e-6))
+    R = np.maximum((1 - s) * (1 - 0.139 * s) / (1 + 1.17 * s), 1e-6)
+    return EVENLY / len(R) + (1 - EVENLY) * R / R.sum()
+
+
 def _homogeneous(medium: Medium) -> VaryingMedium:
     return VaryingMedium(None, np.atleast_1d(medium.sigma_t), None, np.atleast_1d(medium.albedo))
 
@@ -342,6 +353,9 @@ def interaction_of(p: mi.Point3f, medium: WalkMedium | tuple[()]) -> mi.Interact
     return at
 
 
+EVENLY = 0.5  # part of the probability of a channel
+
+
 @dataclass(frozen=True, eq=False)
 class WalkMedia:
     """The translucent objects of a scene, each addressed by its number.
@@ -379,6 +393,7 @@ class WalkMedia:
         for key in ("sigma_t", "sigma_s", "g"):
             scale = 1.0 if key == "g" else self.mm_per_unit
             tables[key] = per_channel([getattr(m, key) for m in media], scale)
+        tables["shares"] = per_channel([_shares(m) for m in media], 1.0)
         tables["eta"] = mi.Float([m.eta for m in media])
 
         # ---- sides of geometric normals: one per shape, or one per face
@@ -485,6 +500,11 @@ class WalkMedia:
     def varies(self) -> bool:
         """Whether a medium varies in space, so that collisions may be null."""
         return self.heterogeneous is not None
+
+    def shares(self, k: mi.Int32) -> mi.Spectrum:
+        """Probability of each channel of a path that begins at object k; even where they are wavelengths of a walk."""
+        n = len(mi.Spectrum(0))
+        return mi.Spectrum(1 / n) if mi.is_spectral or not self.objects else self.spectrum("shares", k)
 
     def spectrum(self, key: str, k: mi.Int32) -> mi.Spectrum:
         """An entry of a table with one column per channel."""

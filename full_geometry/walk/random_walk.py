@@ -163,6 +163,7 @@ class Walk:
     rng: mi.PCG32
     medium: WalkMedium | tuple[()] = ()  # that it took where it entered, see `WalkMedia.fetch`
     within: mi.UInt32 | tuple[()] = ()  # what is around it, where things overlap, see `walk.priorities`
+    kept: mi.Spectrum | tuple[()] = ()  # of a first flight that must not leave, the probability that others do not
 
     def ray(self, t: mi.Float) -> mi.Ray3f:
         """Looks for the boundary on a flight of length t; see `reach` for its distances."""
@@ -241,7 +242,10 @@ class Walker:
         # ---- free path t = -ln(1 - u) / M_k, and the boundary on its way
         media, rng = self.media, walk.rng
         m, u = media.coefficients(walk.object, walk.o, walk.medium), None
-        t = free_path(m, walk.channel, rng.next_float32())
+        draw = rng.next_float32()
+        if len(walk.kept):
+            draw = draw * pick(walk.kept, walk.channel)
+        t = free_path(m, walk.channel, draw)
         ray, p = walk.ray(t), mi.Point3f(walk.o + walk.d * t)
         hit = (media.inner or media).scene.ray_intersect_preliminary(ray, coherent=False)
 
@@ -250,6 +254,9 @@ class Walker:
             m, u = media.coefficients(walk.object, p, walk.medium), rng.next_float32()
         flight = fly(m, walk.weight, walk.density, walk.channel, t, walk.reach(hit.t), u)
         walk = replace(walk, weight=flight.weight, density=flight.density)
+        if len(walk.kept):
+            weight, density = weigh(walk.weight, walk.density, mi.Spectrum(1), 1 / walk.kept)
+            walk = replace(walk, weight=weight, density=density)
 
         # ---- a null collision goes on from p along the same direction; what rounding has put outside ends
         event = Event(p, ray.d, walk.object, m, walk.medium)
@@ -280,6 +287,7 @@ class Walker:
         survives, weight = roulette(weight, scale, rng.next_float32())
         alive = walk.alive & survives & (order <= media.row("most", walk.object)) & media.box.contains(event.p)
         walk = replace(walk, o=event.p, d=d, off=media.behind(walk.object, d), weight=weight, density=density,
+                       kept=mi.Spectrum(1) if len(walk.kept) else (),
                        order=order, alive=alive, object=dr.select(alive, walk.object, OUTSIDE))  # fmt: skip
         return walk, record
 
@@ -298,7 +306,10 @@ class Walker:
         # ---- light through a rough boundary, then reflection with the probability F, else refraction
         counts = media.counts(k, walk.order)
         walk, record = self.visitor.boundary(walk, record, si, ~passes & counts)
-        bs, value = sample_bsdf(media.boundary(k), si, walk.rng)
+        stays = mi.Bool(False)
+        if len(walk.kept):
+            stays, walk = dr.min(walk.kept) < 1, replace(walk, kept=mi.Spectrum(1))
+        bs, value = sample_bsdf(media.boundary(k), si, walk.rng, reflects=stays)
         d, turned = sided(si, bs.wo)
 
         # ---- the way on: outside only with an order that counts; weight *= value, scale *= eta²
@@ -389,16 +400,27 @@ def start_walk(o: mi.Point3f, d: mi.Vector3f, rng: mi.PCG32, medium: WalkMedium 
 
 
 def sample_bsdf(
-    bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, rng: mi.PCG32, ctx: mi.BSDFContext | None = None
-) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
-    """A direction by a BSDF, and its weight."""
+    bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, rng: mi.PCG32, ctx: mi.BSDFContext | None = None,
+    reflects: mi.Bool | bool = False, refracts: mi.Bool | bool = False,
+) -> tuple[mi.BSDFSample3f, mi.Spectrum]:  # fmt: skip
+    """A direction by a BSDF and its weight, 1 for a smooth dielectric that is told what to choose."""
     u, v = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
+    u = dr.select(reflects, 0, dr.select(refracts, 1, u))
     return bsdf.sample(ctx or mi.BSDFContext(), si, u, v)
 
 
 def below(n: int, u: mi.Float) -> mi.UInt32:
     """One of the whole numbers 0 ... n - 1, for a uniform number."""
     return dr.minimum(mi.UInt32(u * n), n - 1)
+
+
+def draw_channel(shares: mi.Spectrum, u: mi.Float) -> tuple[mi.UInt32, mi.Spectrum]:
+    """A channel of these probabilities, and q of a walk that begins with it."""
+    channel, below = mi.UInt32(0), mi.Float(0)
+    for share in list(shares)[:-1]:
+        below = below + share
+        channel = channel + dr.select(u < below, mi.UInt32(0), 1)
+    return channel, shares * len(shares)
 
 
 def draw(n: int, rng: mi.PCG32) -> mi.UInt32:

@@ -214,7 +214,7 @@ def test_precomputed_light_of_two_balls_that_touch_has_the_mean_of_sampled_light
 
 
 def test_precomputed_light_of_a_lamp_has_the_mean_of_sampled_light() -> None:
-    _compare(MEDIUM, 0.015, spp=256, lamp=_lamp())
+    _compare(MEDIUM, 0.015, spp=1024, lamp=_lamp())
 
 
 @pytest.mark.slow
