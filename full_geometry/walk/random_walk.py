@@ -403,7 +403,7 @@ def sample_bsdf(
     bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, rng: mi.PCG32, ctx: mi.BSDFContext | None = None,
     reflects: mi.Bool | bool = False, refracts: mi.Bool | bool = False,
 ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:  # fmt: skip
-    """A direction by a BSDF and its weight, 1 for a smooth dielectric that is told what to choose."""
+    """A direction by a BSDF and its weight: 1 for a smooth dielectric whose choice is given."""
     u, v = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
     u = dr.select(reflects, 0, dr.select(refracts, 1, u))
     return bsdf.sample(ctx or mi.BSDFContext(), si, u, v)
