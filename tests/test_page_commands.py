@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from materials.test_looks import glb, mtlx
+from PIL import Image
 
 pytestmark = pytest.mark.slow
 
@@ -30,6 +31,7 @@ LESS = {  # what a command is given beside, by the longest of these that it star
     "curves": "--paths 20000 --theta-i 0",
     "render": "--spp 2",
     "render scene.xml --model path_traced --target-error": "--target-error 0.5",
+    "render toy.xml": "--spp 2 -D size=32",
     "fit": "--steps 2 --spp 2",
     "train object": "--seconds 1",
     "train material": "--steps 20",
@@ -127,6 +129,11 @@ def _start(line: str, starts: dict[str, str]) -> str | None:
     return max((start for start in starts if words.startswith(start)), key=len, default=None)
 
 
+def _shortened(line: str) -> str:
+    start = _start(line, LESS)
+    return line if start is None else f"{line} {LESS[start]}"
+
+
 def _items(page: str) -> list[tuple[str, str]]:
     """Kind and text of what runs, in the order of the page."""
     found = []
@@ -134,8 +141,7 @@ def _items(page: str) -> list[tuple[str, str]]:
         found += [("python", text)] if kind == "python" else []
         for line in _commands(text) if kind == "bash" else ():
             if _start(line, UNDERSTOOD) is None:
-                start = _start(line, LESS)
-                found.append(("bash", line if start is None else f"{line} {LESS[start]}"))
+                found.append(("bash", _shortened(line)))
     return found
 
 
@@ -166,6 +172,11 @@ def _lay_out(page: str, folder: Path) -> None:
     elif page == "docs/materials.md":
         mtlx(folder)
         glb(folder)
+    elif page == "docs/rendering.md":
+        (folder / "toy.xml").write_text(_of_kind(page, "xml"))
+        shutil.copy(ROOT / "docs" / "scenes" / "toy.ply", folder)
+        shutil.copy(ROOT / "figures" / "assets" / "studio.exr", folder / "sky.exr")
+        Image.new("RGB", (8, 8), (200, 140, 120)).save(folder / "skin.png")
     elif page == "docs/inverse.md":
         scene = _of_kind(page, "xml")
         truth = scene.replace('name="albedo" value="0.8"', 'name="albedo" value="0.97, 0.93, 0.8"')
@@ -186,7 +197,17 @@ def _lay_out(page: str, folder: Path) -> None:
 def wrong(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
     """By page, what failed."""
     top = tmp_path_factory.mktemp("pages")
-    items = list(_pages(top))
+    ran = _run(top, list(_pages(top)))
+    if told := os.environ.get("HALFSPACE_SSS_PAGES"):
+        Path(told).write_text(json.dumps(ran, indent=1))
+    failed: dict[str, list[str]] = {Path(page).stem: [] for page in PAGES}
+    for folder, text, error, _ in ran:
+        failed[Path(folder).name] += [f"{text}: {error}"] if error else []
+    return failed
+
+
+def _run(top: Path, items: list[tuple[str, str, str]]) -> list[list]:
+    """Folder, text, error and CPU seconds of each item, run in one process with an empty home."""
     (top / "home").mkdir()
     kept = {key: value for key, value in os.environ.items() if not key.startswith(HOME)}
     run = subprocess.run(
@@ -195,12 +216,7 @@ def wrong(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
     )  # fmt: skip
     ran = [json.loads(line.removeprefix("RAN ")) for line in run.stdout.splitlines() if line.startswith("RAN ")]
     assert [row[:2] for row in ran] == [[folder, text] for folder, _, text in items], run.stderr[-2000:]
-    if told := os.environ.get("HALFSPACE_SSS_PAGES"):
-        Path(told).write_text(json.dumps(ran, indent=1))
-    failed: dict[str, list[str]] = {Path(page).stem: [] for page in PAGES}
-    for folder, text, error, _ in ran:
-        failed[Path(folder).name] += [f"{text}: {error}"] if error else []
-    return failed
+    return ran
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -155,7 +155,7 @@ def render(picture: Picture) -> dict[str, bytes]:
     shots, files = [Shot("rendered", np.maximum(picture.image, 0.0), dict(picture.numbers))], {}
     if picture.clean is not None:
         clean, numbers = picture.clean
-        shots.append(Shot("denoised", clean, dict(numbers)))
+        shots.append(Shot("denoised", np.maximum(clean, 0.0), dict(numbers)))
         files = {"denoised.exr": picture.exr(clean), "denoised.png": picture.png(clean)}
     text = page(picture.title, {picture.title: shots}, caption=picture.caption, lower_is_better=())
     return {"html": text.encode(), **files}
