@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from analytic_models._diffusion import DiffuseBoundary, safe_differences
-from halfspace_sss.arrays import Real
+from halfspace_sss.arrays import Real, library
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.interface.query import Query
 from halfspace_sss.physics.medium import Medium
@@ -20,12 +18,13 @@ class _Coefficients:
 
     def __init__(self, medium: Medium, boundary: DiffuseBoundary) -> None:
         m = medium.in_mfp()
+        lib = library(m.sigma_s)
         self.D = 1 / (3 * m.sigma_t_prime)
-        self.sigma_tr = np.sqrt(3 * m.sigma_a * m.sigma_t_prime)
+        self.sigma_tr = lib.sqrt(3 * m.sigma_a * m.sigma_t_prime)
         # without scattering d_e is infinite: any finite value will do under the factor 0
-        self.d_e = 2.131 * self.D / np.sqrt(np.maximum(m.albedo_prime, 1e-100))
+        self.d_e = 2.131 * self.D / lib.sqrt(lib.maximum(m.albedo_prime, 1e-100))
         self.h = 2 * boundary.A * self.d_e
-        self.scale = np.where(np.asarray(m.sigma_s) > 0, 1.0, 0.0) / (4 * math.pi**2 * boundary.N)
+        self.scale = lib.where(m.sigma_s > 0, 1.0, 0 * m.sigma_s) / (4 * math.pi**2 * boundary.N)
 
 
 class DirectionalDipole(BSSRDF):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from analytic_models._diffusion import unit_gauss
-from halfspace_sss.arrays import Library, Real
+from halfspace_sss.arrays import Library, Real, library
 from halfspace_sss.checks import check_choice
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.interface.query import Query
@@ -106,21 +106,25 @@ class ForwardScatteringDipole(BSSRDF):
 
     def __init__(self, medium: Medium, *, n_samples: int = 16, virtual_source: str = "classical") -> None:
         super().__init__(medium)
-        if np.min(medium.g) < 0:
-            raise ValueError(f"g must be >= 0 for the forward-scattering dipole, got {float(np.min(medium.g))!r}")
+        least_g = float(np.min(medium.detached().g))
+        if least_g < 0:
+            raise ValueError(f"g must be >= 0 for the forward-scattering dipole, got {least_g!r}")
         if not (isinstance(n_samples, int) and 2 <= n_samples <= 1000):
             raise ValueError(f"n_samples must be an integer in [2, 1000], got {n_samples!r}")
         check_choice("virtual_source", virtual_source, VIRTUAL_SOURCES)
         self.n_samples, self.virtual_source = n_samples, virtual_source
         m = medium.in_mfp()
-        self._p = np.maximum(0.5 * m.sigma_s * (1 - m.g), 1e-12)
+        lib = library(m.sigma_s)
+        self._p = lib.maximum(0.5 * m.sigma_s * (1 - m.g), 1e-12)
         self._absorption = m.sigma_a / self._p
         D = 1 / (3 * m.sigma_t_prime)
         if virtual_source == "grosjean":
             D = (2 * m.sigma_a + m.sigma_s_prime) / (3 * m.sigma_t_prime**2)
-        half_z_v = 2 * D if virtual_source != "directional" else 2.131 * D / np.sqrt(np.maximum(m.albedo_prime, 1e-20))
+        half_z_v = 2 * D
+        if virtual_source == "directional":
+            half_z_v = 2.131 * D / lib.sqrt(lib.maximum(m.albedo_prime, 1e-20))
         self._z_v = 2 * boundary_A(m.eta) * half_z_v * self._p
-        self._scale = np.where(np.asarray(m.sigma_s) > 0, self._p**2, 0.0) / (4 * math.pi**2.5) / m.eta**2
+        self._scale = lib.where(m.sigma_s > 0, self._p**2, 0.0) / (4 * math.pi**2.5) / m.eta**2
 
     def G(self, q: Query) -> Real:
         q = q.in_float64()

@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from analytic_models._diffusion import unit_gauss
-from halfspace_sss.arrays import Real
+from halfspace_sss.arrays import Real, library
 from halfspace_sss.interface.model import Separable, exit_normaliser
 from halfspace_sss.interface.query import Query
 from halfspace_sss.physics.fresnel import C_1
@@ -29,19 +29,20 @@ def _nodes() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return deficit, kernel, 2 * w_mu * mu[:-1, 0]
 
 
-def matched_albedos(albedo: float) -> tuple[float, float]:
+def matched_albedos(albedo: Real) -> tuple[Real, Real]:
     """Reflectance of an isotropic half-space without a boundary: under normal and under diffuse incidence.
 
     1 - sqrt(1 - albedo) H(1) and 1 - 2 sqrt(1 - albedo) ∫ H(mu) mu dmu, with
     ln H(mu) = -(mu/pi) ∫_0^(pi/2) ln(1 - albedo theta cot theta) / (cos² theta + mu² sin² theta) dtheta.
     Source: Chandrasekhar 1960; both vanish with the albedo without loss of digits.
     """
-    deficit, kernel, w_mu = _nodes()
+    lib = library(albedo)
+    deficit, kernel, w_mu = (lib.like(v, albedo) for v in _nodes())
     # 1 - albedo theta cot theta, each form where it keeps its digits
-    log = np.log1p(-albedo * (1 - deficit)) if albedo < 0.5 else np.log((1 - albedo) + albedo * deficit)
-    half_log = 0.5 * math.log1p(-albedo) if albedo < 1 else -math.inf
-    plane = -np.expm1(half_log - kernel @ log)  # plane albedo at mu
-    return abs(float(plane[-1])), float(w_mu @ plane[:-1])  # abs: -0 at albedo 0
+    log = lib.log1p(-albedo * (1 - deficit)) if albedo < 0.5 else lib.log((1 - albedo) + albedo * deficit)
+    half_log = 0.5 * lib.log1p(-albedo) if albedo < 1 else -math.inf
+    plane = -lib.expm1(half_log - kernel @ log)  # plane albedo at mu
+    return abs(plane[-1]), w_mu @ plane[:-1]  # abs: -0 at albedo 0
 
 
 class NormalizedDiffusion(Separable):
@@ -66,11 +67,11 @@ class NormalizedDiffusion(Separable):
     def __init__(self, medium: Medium) -> None:
         super().__init__(medium)
         m = medium.in_mfp()
-        albedos = [matched_albedos(float(a)) for a in np.atleast_1d(m.albedo_prime)]
-        A_0, A_d = np.array(albedos).T.reshape(2, *np.shape(m.albedo_prime))
+        albedos = [matched_albedos(m.channel(k).albedo_prime) for k in range(m.n_channels or 1)]
+        A_0, A_d = albedos[0] if m.n_channels is None else map(library(m.sigma_s).stack, zip(*albedos))
         rho = 2 * C_1(medium.eta)
         self.A = A_0 * (1 - rho) / (1 - rho * A_d)
-        self.d = 1 / (m.sigma_t_prime * (1.85 - A_0 + 7 * np.abs(A_0 - 0.8) ** 3))
+        self.d = 1 / (m.sigma_t_prime * (1.85 - A_0 + 7 * abs(A_0 - 0.8) ** 3))
 
     @property
     def N(self) -> float:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
-from halfspace_sss.arrays import Real
+from halfspace_sss.arrays import Real, library
 from halfspace_sss.interface.model import Separable, exit_normaliser
 from halfspace_sss.interface.query import Query
 from halfspace_sss.physics.fresnel import boundary_A_jensen
@@ -19,7 +17,7 @@ class _Dipole:
     def __init__(self, medium: Medium) -> None:
         m = medium.in_mfp()
         self.albedo_prime = m.albedo_prime
-        self.sigma_tr = np.sqrt(3 * m.sigma_a * m.sigma_t_prime)
+        self.sigma_tr = library(m.sigma_a).sqrt(3 * m.sigma_a * m.sigma_t_prime)
         self.z_r = 1 / m.sigma_t_prime
         self.z_v = self.z_r * (1 + 4 / 3 * boundary_A_jensen(m.eta))
 

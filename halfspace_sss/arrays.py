@@ -39,10 +39,15 @@ def _fold(f: Callable[..., tuple], tables: tuple, state: tuple, x: Real) -> tupl
     return state
 
 
+def _check_no_derivatives(value: Real) -> None:
+    if getattr(value, "requires_grad", False):
+        raise ValueError("a medium with derivatives is asked with torch tensors: use medium.detached() for its numbers")
+
+
 class _NumpyLibrary:
     """NumPy, and plain Python numbers."""
 
-    exp, expm1, log, sqrt = (staticmethod(f) for f in (np.exp, np.expm1, np.log, np.sqrt))
+    exp, expm1, log, log1p, sqrt = (staticmethod(f) for f in (np.exp, np.expm1, np.log, np.log1p, np.sqrt))
     sin, cos, abs, where = (staticmethod(f) for f in (np.sin, np.cos, np.abs, np.where))
     minimum, maximum, isfinite = (staticmethod(f) for f in (np.minimum, np.maximum, np.isfinite))
     arctan2, floor = (staticmethod(f) for f in (np.arctan2, np.floor))
@@ -61,6 +66,7 @@ class _NumpyLibrary:
 
     @staticmethod
     def constant(value: Real, x: Real) -> Real:
+        _check_no_derivatives(value)
         return np.asarray(value, dtype=np.asarray(x).dtype) if np.ndim(value) else float(value)
 
     @staticmethod
@@ -82,7 +88,7 @@ class _TorchLibrary:
         import torch
 
         self.torch = torch
-        for name in ("exp", "expm1", "log", "sqrt", "sin", "cos", "abs", "where", "isfinite", "floor"):
+        for name in ("exp", "expm1", "log", "log1p", "sqrt", "sin", "cos", "abs", "where", "isfinite", "floor"):
             setattr(self, name, getattr(torch, name))
 
     def _pair(self, a: Real, b: Real) -> tuple[torch.Tensor, torch.Tensor]:
@@ -110,7 +116,7 @@ class _TorchLibrary:
         return self.torch.finfo(x.dtype).max
 
     def constant(self, value: Real, x: torch.Tensor) -> torch.Tensor:
-        return self.like(value, x) if np.ndim(value) else float(value)
+        return self.like(value, x) if np.ndim(value) or isinstance(value, self.torch.Tensor) else float(value)
 
     fold = staticmethod(_fold)
 
@@ -150,6 +156,7 @@ class _DrJitLibrary:
         return self.dr.largest(type(x))
 
     def constant(self, value: Real, x: Lanes) -> Lanes:
+        _check_no_derivatives(value)
         if np.ndim(value):
             raise ValueError("a Dr.Jit query is answered by a medium of one channel: use medium.channel(k)")
         return self.dr.opaque(type(x), float(value))  # kernels then differ in their data, and are compiled once

@@ -97,6 +97,7 @@ class BSSRDF(abc.ABC):
                 Arguments broadcast as in NumPy; a medium with channels adds its channel axis last.
 
         Derivatives by torch are recorded in blocks, so that their memory is bounded; the numbers are the same.
+        Derivatives with respect to a medium of tensors are recorded at once.
 
         Raises:
             ValueError: an argument is out of range or not a number (NumPy and torch; Dr.Jit lanes cannot be

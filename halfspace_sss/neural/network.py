@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from halfspace_sss.arrays import Lanes, Library, Real, library
+from halfspace_sss.arrays import Lanes, Library, Real, is_torch, library
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.interface.query import Query
 from halfspace_sss.neural.perceptron import Perceptron, relu, silu
@@ -139,7 +139,7 @@ class Network:
     """h_{k+1} = a(h_k W_k + b_k), the last layer without a.
 
     Args:
-        matrices: W_k of shape (inputs, outputs), NumPy float32.
+        matrices: W_k of shape (inputs, outputs), NumPy float32, or tensors with derivatives.
         biases: b_k of shape (outputs,).
         activation: a, SILU or RELU.
     """
@@ -149,15 +149,15 @@ class Network:
     activation: Activation = SILU
 
     @classmethod
-    def from_vector(
-        cls, vector: np.ndarray, shapes: Sequence[tuple[int, int]], activation: Activation = SILU
-    ) -> Network:
+    def from_vector(cls, vector: Real, shapes: Sequence[tuple[int, int]], activation: Activation = SILU) -> Network:
         """The network whose numbers stand in `vector` layer after layer, each matrix before its bias."""
         matrices, biases, at = [], [], 0
+        if not is_torch(library(vector)):
+            vector = np.asarray(vector, np.float32)
         for n_in, n_out in shapes:
-            matrices.append(np.ascontiguousarray(vector[at : at + n_in * n_out].reshape(n_in, n_out), np.float32))
+            matrices.append(vector[at : at + n_in * n_out].reshape(n_in, n_out))
             at += n_in * n_out
-            biases.append(np.ascontiguousarray(vector[at : at + n_out], np.float32))
+            biases.append(vector[at : at + n_out])
             at += n_out
         return cls(tuple(matrices), tuple(biases), activation)
 
@@ -201,8 +201,8 @@ class Network:
         x = torch.stack(torch.broadcast_tensors(*features), dim=-1)
         tensors, key = self._tensors, (x.dtype, x.device)
         if key not in tensors:
-            pairs = [(np.ascontiguousarray(W.T), b) for W, b in zip(self.matrices, self.biases)]
-            tensors[key] = [tuple(torch.from_numpy(v).to(x) for v in pair) for pair in pairs]
+            pairs = zip(self.matrices, self.biases)
+            tensors[key] = [(torch.as_tensor(W).T.contiguous().to(x), torch.as_tensor(b).to(x)) for W, b in pairs]
         *hidden, (W, b) = tensors[key]
         for V, c in hidden:
             x = self.activation.torch(torch.nn.functional.linear(x, V, c))

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from halfspace_sss.checks import check_interval
-from halfspace_sss.physics.medium import Medium
+from halfspace_sss.physics.medium import Medium, check_numbers
 from halfspace_sss.provenance import JsonDict, check_folder, path_of, read_bytes, read_text, write_together
 
 FORMAT = 1
@@ -188,6 +188,7 @@ def check_weights_folder(folder: str | Path | None = None) -> Path:
 
 def weights_name(kind: str, medium: Medium) -> str:
     """File name of the weights of a scalar medium: all that counts is albedo, g and eta, to eight digits."""
+    check_numbers(f"medium of {kind}", medium)
     numbers = (f"{name}{value}" for name, value in _digits(medium).items())
     return "-".join((kind, *numbers)) + ".safetensors"
 

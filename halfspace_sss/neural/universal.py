@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from halfspace_sss.arrays import library
+from halfspace_sss.arrays import Real, is_torch, library
 from halfspace_sss.lazy import once
 from halfspace_sss.neural.network import (
     N_FEATURES,
@@ -41,6 +41,7 @@ def check_range(medium: Medium) -> None:
     Raises:
         ValueError: albedo, g or eta is outside `RANGES`, or g above `MOST_G_THERE` at an eta below `NEARLY_MATCHED`.
     """
+    medium = medium.detached()
     for name, (low, high) in RANGES.items():
         for value in np.atleast_1d(getattr(medium, name)):
             if not low <= value <= high + 1e-9:
@@ -82,14 +83,18 @@ class Hypernetwork:
     depth: int
     calibration_layers: Layers = ()
 
-    def network(self, albedo: float, g: float, eta: float) -> Network:
-        """The small network of a medium; takes numbers."""
+    def network(self, albedo: Real, g: Real, eta: float) -> Network:
+        """The small network of a medium; albedo and g are numbers, or tensors of float64."""
         h = _layered(self.medium_layers, albedo, g, eta)
-        return Network.from_vector(self.base + h @ self.basis.astype(np.float64), self.shapes)
+        base, basis = (library(h).like(v, h) for v in (self.base, self.basis))
+        return Network.from_vector(base + h @ basis, self.shapes)
 
-    def calibration(self, albedo: float, g: float, eta: float) -> tuple[float, ...]:
-        """The coefficients of log a of a medium, see `network.log_calibration`; takes numbers."""
-        return tuple(_layered(self.calibration_layers, albedo, g, eta).tolist()) if self.calibration_layers else ()
+    def calibration(self, albedo: Real, g: Real, eta: float) -> tuple[Real, ...]:
+        """The coefficients of log a of a medium, see `network.log_calibration`; takes what `network` does."""
+        if not self.calibration_layers:
+            return ()
+        c = _layered(self.calibration_layers, albedo, g, eta)
+        return tuple(c if is_torch(library(c)) else c.tolist())
 
     @property
     def shapes(self) -> list[tuple[int, int]]:
@@ -106,12 +111,14 @@ def named_layers(name: str, layers: Layers) -> dict[str, np.ndarray]:
     return {f"{name}_{k}_{n}": v for k, pair in enumerate(layers) for n, v in zip("Wb", pair)}
 
 
-def _layered(layers: Layers, albedo: float, g: float, eta: float) -> np.ndarray:
-    h = np.array(medium_features(library(0.0), albedo, g, eta, length_scale(albedo, g)))
+def _layered(layers: Layers, albedo: Real, g: Real, eta: float) -> Real:
+    lib = library(albedo)
+    albedo, g, eta, L = (lib.like(v, albedo) for v in (albedo, g, eta, length_scale(albedo, g)))
+    h = lib.stack(medium_features(lib, albedo, g, eta, L))
     for k, (W, b) in enumerate(layers):
-        h = h @ W.astype(np.float64) + b
+        h = h @ lib.like(W, h) + lib.like(b, h)
         if k < len(layers) - 1:
-            h = h / (1 + np.exp(-h))
+            h = h / (1 + lib.exp(-h))
     return h
 
 
@@ -181,7 +188,7 @@ class Neural(SymmetricModel):
         check_range(medium)
         self.weights = weights or shipped_weights()
         hyper = load_hypernetwork(self.weights)
-        ratios = [(float(m.albedo), float(np.float64(m.g)), m.eta) for m in channels(medium)]
+        ratios = [(m.albedo, m.g, m.eta) for m in channels(medium)]
         self.networks = [hyper.network(*one) for one in ratios]
         self.calibrations = [hyper.calibration(*one) for one in ratios]
 

@@ -14,7 +14,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from halfspace_sss.arrays import Real, library
+from halfspace_sss.arrays import Real, is_torch, library
 from halfspace_sss.physics.reflectance import DIFFUSE, albedo_of_reflectance, half_space_reflectance
 
 INDICES = (0.01, 100.0)  # relative: beyond, Fresnel's moments lose their digits
@@ -23,9 +23,9 @@ DIFFUSE_LIMIT = 1e-3  # of the largest mean free path of all channels
 CLEAR = "a clear layer is sigma_s = 1e-9, g = 0"
 
 
-def _check(name: str, value: np.ndarray, ok: np.ndarray, bound: str, hint: str = "") -> None:
-    if not np.all(ok):
-        bad = np.atleast_1d(value)[~np.atleast_1d(ok)][0]
+def _check(name: str, value: Real, ok: Real, bound: str, hint: str = "") -> None:
+    if not ok.all():
+        bad = value.reshape(-1)[~ok.reshape(-1)][0]
         raise ValueError(f"{name} must be {bound}, got {bad.item()!r}{hint}")
 
 
@@ -33,12 +33,26 @@ def _number(name: str, value: object) -> np.ndarray:
     try:
         if value is None or isinstance(value, (str, bytes)):  # NumPy would make NaN of one, read the other
             raise TypeError
-        array = np.array(value, dtype=np.float64) + 0.0  # no -0.0, whose hash is not that of 0.0
-    except (TypeError, ValueError, OverflowError) as error:
+        array = np.asarray(value, dtype=np.float64) + 0.0  # no -0.0, whose hash is not that of 0.0
+    except (TypeError, ValueError, OverflowError, RuntimeError) as error:  # RuntimeError: torch, for requires_grad
         raise ValueError(f"{name} must be a number or a sequence of numbers, got {value!r}") from error
+    return _scalar_or_channels(name, np.asarray(array))
+
+
+def _scalar_or_channels(name: str, array: Real) -> Real:
     if array.ndim > 1:
-        raise ValueError(f"{name} must be a scalar or one value per channel, got shape {array.shape}")
-    return np.asarray(array)
+        raise ValueError(f"{name} must be a scalar or one value per channel, got shape {tuple(array.shape)}")
+    return array
+
+
+def _coefficients(**given: object) -> dict[str, Real]:
+    """Each as an array of float64; all as tensors where torch records derivatives by one."""
+    traced = [value for value in given.values() if getattr(value, "requires_grad", False)]
+    numbers = {name: v if traced and is_torch(library(v)) else _number(name, v) for name, v in given.items()}
+    if not traced:
+        return numbers
+    lib, like = library(traced[0]), traced[0].double()
+    return {name: _scalar_or_channels(name, lib.like(value, like)) for name, value in numbers.items()}
 
 
 def _index(name: str, value: object) -> float:
@@ -49,18 +63,19 @@ def _index(name: str, value: object) -> float:
     return float(index)
 
 
-def _between(value: np.ndarray, bounds: tuple[float, float]) -> tuple[np.ndarray, str]:
+def _between(value: Real, bounds: tuple[float, float]) -> tuple[Real, str]:
     """Where a value is within bounds, and the bounds in words."""
     return (value >= bounds[0]) & (value <= bounds[1]), f"in [{bounds[0]:g}, {bounds[1]:g}]"
 
 
-def _common_shape(**fields: np.ndarray) -> tuple[int, ...]:
+def _common_shape(**fields: Real) -> tuple[int, ...]:
     """Shape of coefficients together: () or (channels,)."""
     try:
-        return np.broadcast_shapes(*(value.shape for value in fields.values()))
+        return np.broadcast_shapes(*(tuple(value.shape) for value in fields.values()))
     except ValueError as error:
         *first, last = fields
-        names, shapes = f"{', '.join(first)} and {last}", ", ".join(str(value.shape) for value in fields.values())
+        shapes = ", ".join(str(tuple(value.shape)) for value in fields.values())
+        names = f"{', '.join(first)} and {last}"
         raise ValueError(f"{names} must have the same number of channels, got {shapes}") from error
 
 
@@ -95,37 +110,43 @@ class Medium:
         eta: relative index n_inside / n_outside, one number in [0.01, 100].
 
     Everything else (`sigma_t`, `albedo`, `sigma_s_prime`, ...) derives from these four. Scalars stay
-    scalars; if any coefficient has one value per channel, all have.
+    scalars; if any coefficient has one value per channel, all have. sigma_s, sigma_a and g may be torch tensors that
+    require gradients: all three are then tensors of float64, and S of a torch query has gradients with respect to
+    them (make medium and model anew for each step of an optimiser). `detached` gives the numbers. Such a medium equals
+    no other.
 
     Raises:
         ValueError: a coefficient is outside its range, not finite, has mismatched channels, or
             sigma_s + sigma_a is outside [1e-18, 1e18], as 0 is (a mean free path would be infinite).
     """
 
-    sigma_s: np.ndarray | float
-    sigma_a: np.ndarray | float
-    g: np.ndarray | float = 0.0
+    sigma_s: Real
+    sigma_a: Real
+    g: Real = 0.0
     eta: float = 1.3
 
     def __post_init__(self) -> None:
-        fields = {name: _number(name, getattr(self, name)) for name in ("sigma_s", "sigma_a", "g")}
-        eta = _index("eta", self.eta)
+        fields = _coefficients(sigma_s=self.sigma_s, sigma_a=self.sigma_a, g=self.g)
+        lib, eta = library(*fields.values()), _index("eta", self.eta)
         for name in ("sigma_s", "sigma_a"):
             value = fields[name]
-            _check(name, value, np.isfinite(value) & (value >= 0), "finite and >= 0 (1/mm)")
-        hint = f"; with g = 1 nothing is scattered: {CLEAR}" if np.any(fields["g"] == 1) else ""
-        _check("g", fields["g"], np.abs(fields["g"]) < 1, "in the open interval (-1, 1)", hint)
+            _check(name, value, lib.isfinite(value) & (value >= 0), "finite and >= 0 (1/mm)")
+        hint = f"; with g = 1 nothing is scattered: {CLEAR}" if (fields["g"] == 1).any() else ""
+        _check("g", fields["g"], lib.abs(fields["g"]) < 1, "in the open interval (-1, 1)", hint)
         shape = _common_shape(**fields)
         if shape == (0,):
             raise ValueError("sigma_s must have at least one channel, got none")
         for name, value in fields.items():
+            if is_torch(lib):
+                object.__setattr__(self, name, value.broadcast_to(shape))
+                continue
             value = np.broadcast_to(value, shape)
             object.__setattr__(self, name, value.copy() if shape else float(value))
             if shape:
                 getattr(self, name).setflags(write=False)
         object.__setattr__(self, "eta", eta)
-        sigma_t = np.asarray(self.sigma_t)
-        hint = "" if np.any(sigma_t > 0) else f"; {CLEAR}"
+        sigma_t = self.sigma_t if is_torch(lib) else np.asarray(self.sigma_t)
+        hint = "" if (sigma_t > 0).any() else f"; {CLEAR}"
         ok, bound = _between(sigma_t, EXTINCTIONS)
         _check("sigma_t = sigma_s + sigma_a", sigma_t, ok, f"{bound} (1/mm)", hint)
 
@@ -135,20 +156,19 @@ class Medium:
 
         sigma_s = albedo sigma_t, sigma_a = (1 - albedo) sigma_t.
         """
-        albedo, sigma_t = _number("albedo", albedo), _number("sigma_t", sigma_t)
+        albedo, sigma_t = _coefficients(albedo=albedo, sigma_t=sigma_t).values()
         _check("albedo", albedo, (albedo >= 0) & (albedo <= 1), "in [0, 1]")
-        _check("sigma_t", sigma_t, np.isfinite(sigma_t) & (sigma_t > 0), "finite and > 0 (1/mm)")
+        _check("sigma_t", sigma_t, library(sigma_t).isfinite(sigma_t) & (sigma_t > 0), "finite and > 0 (1/mm)")
         _common_shape(albedo=albedo, sigma_t=sigma_t)
         return cls(albedo * sigma_t, (1 - albedo) * sigma_t, g, eta)
 
     @classmethod
     def from_reduced(cls, sigma_s_prime, sigma_a, g=0.0, eta=1.3) -> Medium:
         """The medium whose reduced scattering is sigma_s_prime (1/mm): sigma_s = sigma_s_prime / (1 - g)."""
-        sigma_s_prime, g = _number("sigma_s_prime", sigma_s_prime), _number("g", g)
-        _check(
-            "sigma_s_prime", sigma_s_prime, np.isfinite(sigma_s_prime) & (sigma_s_prime >= 0), "finite and >= 0 (1/mm)"
-        )
-        _check("g", g, np.abs(g) < 1, "in the open interval (-1, 1)")
+        sigma_s_prime, g = _coefficients(sigma_s_prime=sigma_s_prime, g=g).values()
+        ok = library(sigma_s_prime).isfinite(sigma_s_prime) & (sigma_s_prime >= 0)
+        _check("sigma_s_prime", sigma_s_prime, ok, "finite and >= 0 (1/mm)")
+        _check("g", g, abs(g) < 1, "in the open interval (-1, 1)")
         _common_shape(sigma_s_prime=sigma_s_prime, g=g)
         return cls(sigma_s_prime / (1 - g), sigma_a, g, eta)
 
@@ -256,6 +276,7 @@ class Medium:
         mu_i is the cosine of incidence, or "diffuse" for uniform radiance from above. Exact by discrete
         ordinates; left out is what the boundary mirrors.
         """
+        check_numbers("medium", self)
         pairs = np.broadcast(self.albedo, self.g)
         result = np.array([half_space_reflectance(float(a), float(g), self.eta, mu_i) for a, g in pairs])
         return result if self.n_channels is not None else float(result[0])
@@ -313,15 +334,27 @@ class Medium:
         n = self.n_channels or 1
         if not isinstance(index, numbers.Integral) or not 0 <= index < n:
             raise ValueError(f"channel must be a whole number in [0, {n - 1}], got {index!r}")
-        s, a, g = (np.atleast_1d(v)[index] for v in (self.sigma_s, self.sigma_a, self.g))
-        return Medium(float(s), float(a), float(g), self.eta)
+        s, a, g = (v if self.n_channels is None else v[index] for v in (self.sigma_s, self.sigma_a, self.g))
+        return Medium(s, a, g, self.eta)
+
+    @property
+    def has_derivatives(self) -> bool:
+        """Whether torch records derivatives by the coefficients."""
+        return is_torch(library(self.sigma_s))
+
+    def detached(self) -> Medium:
+        """The medium of the same numbers, without gradients."""
+        if not self.has_derivatives:
+            return self
+        return Medium(*(v.detach().tolist() for v in (self.sigma_s, self.sigma_a, self.g)), self.eta)
 
     def __str__(self) -> str:
         """sigma_t (1/mm), albedo, g and eta; one number for each channel where they differ."""
+        numbers = self.detached()
         parts = (
-            ("sigma_t", self.sigma_t, "/mm"),
-            ("albedo", self.albedo, ""),
-            ("g", self.g, ""),
+            ("sigma_t", numbers.sigma_t, "/mm"),
+            ("albedo", numbers.albedo, ""),
+            ("g", numbers.g, ""),
             ("eta", self.eta, ""),
         )
         return ", ".join(f"{name} {_short(value)}{unit}" for name, value, unit in parts)
@@ -332,16 +365,20 @@ class Medium:
         head = "".join(f"<th>{name} {units.get(name, '')}</th>" for name in names)
         rows = "".join(
             "<tr>" + "".join(f"<td>{_short(getattr(m, name))}</td>" for name in names) + "</tr>"
-            for m in ([self] if self.n_channels is None else [self.channel(k) for k in range(self.n_channels)])
+            for m in (self.detached().channel(k) for k in range(self.n_channels or 1))
         )
         return f"<table><caption>medium, eta {self.eta:.4g}</caption><tr>{head}</tr>{rows}</table>"
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Medium):
             return NotImplemented
+        if self.has_derivatives or other.has_derivatives:
+            return self is other
         return all(np.array_equal(getattr(self, n), getattr(other, n)) for n in ("sigma_s", "sigma_a", "g", "eta"))
 
     def __hash__(self) -> int:
+        if self.has_derivatives:
+            return id(self)
         return hash(tuple(np.asarray(getattr(self, n)).tobytes() for n in ("sigma_s", "sigma_a", "g", "eta")))
 
 
@@ -351,11 +388,18 @@ def _short(value: float | np.ndarray) -> str:
     return results[0] if len(set(results)) == 1 else " ".join(results)
 
 
+def check_numbers(name: str, medium: Medium) -> None:
+    """ValueError if torch records derivatives by the coefficients, which would be lost."""
+    if medium.has_derivatives:
+        raise ValueError(f"{name} must be of numbers (take medium.detached()), got tensors with derivatives: {medium}")
+
+
 def check_scalar_medium(medium: object) -> None:
     if not isinstance(medium, Medium):
         raise ValueError(f"medium must be a Medium, got {type(medium).__name__}")
     if medium.n_channels is not None:
         raise ValueError(f"medium must have one channel (take medium.channel(k)), got {medium.n_channels} channels")
+    check_numbers("medium", medium)
 
 
 @runtime_checkable

@@ -52,6 +52,25 @@ def test_derivatives_at_the_bounds_of_all_arguments_are_finite(name):
             assert np.isfinite(by_torch(model, QUERIES, kind)).all(), model.medium
 
 
+def test_torch_differentiates_with_respect_to_the_medium(name):
+    """By sigma_s (per channel), sigma_a and g; the two networks of single media, whose weights are fixed, refuse."""
+    r = torch.tensor([[0.3], [1.0], [4.0]], dtype=torch.float64)
+    numbers = ([1.0, 2.0], 0.1, 0.3)
+
+    def S(*coefficients) -> torch.Tensor:
+        return halfspace_sss.bssrdf(name, Medium(*coefficients, 1.4)).eval(r, [0.9, 0.4], 0.2, 0.8, 0.3)
+
+    tensors = [torch.tensor(v, dtype=torch.float64, requires_grad=True) for v in numbers]
+    if name in ("neural_material", "neural_paper"):
+        with pytest.raises(ValueError, match=f"medium of {name} must be of numbers"):
+            S(*tensors)
+        return
+    torch.testing.assert_close(S(*tensors).detach(), S(*numbers), rtol=1e-6, atol=0)  # weights of numbers are float32
+    assert torch.autograd.gradcheck(S, tensors, eps=1e-5, atol=1e-9, rtol=1e-5, fast_mode=True)
+    with pytest.raises(ValueError, match="a medium with derivatives is asked with torch tensors"):
+        halfspace_sss.bssrdf(name, Medium(*tensors, 1.4)).eval(0.3, 0.9, 0.2, 0.8, 0.3)
+
+
 def test_dr_jit_has_the_derivatives_of_torch_backwards(name):
     if name == "neural_paper":
         pytest.skip("computes in double precision, in which Dr.Jit does not differentiate layers")

@@ -75,15 +75,6 @@ def _finite_differences() -> dict[str, float]:
     return {k: (total(**{**RATIOS, k: v + h}) - total(**{**RATIOS, k: v - h})) / (2 * h) for k, v in RATIOS.items()}
 
 
-def test_torch_differentiates_with_respect_to_the_medium():
-    torch = pytest.importorskip("torch")
-    ratios = {k: torch.tensor(v, dtype=torch.float64, requires_grad=True) for k, v in RATIOS.items()}
-    S = neural_S(**ratios, **_named(lambda x: torch.as_tensor(x, dtype=torch.float64)))
-    S.sum().backward()
-    for name, slope in _finite_differences().items():
-        assert ratios[name].grad.item() == pytest.approx(slope, rel=1e-2)
-
-
 def test_drjit_differentiates_with_respect_to_the_medium():
     import drjit as dr
     from drjit.llvm.ad import Float
@@ -101,5 +92,5 @@ def _named(convert) -> dict:
 
 
 def test_numbers_are_refused_where_gradients_are_asked_for():
-    with pytest.raises(ValueError, match="sigma_t must be a torch tensor or Dr.Jit array"):
+    with pytest.raises(ValueError, match="sigma_t must be a Dr.Jit array, got float"):
         neural_S(**RATIOS, **_named(lambda x: x))

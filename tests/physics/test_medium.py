@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+import halfspace_sss
 from halfspace_sss import Medium
 
 SCALAR = dict(sigma_s=2.0, sigma_a=0.5, g=0.25, eta=1.4)
@@ -75,6 +76,24 @@ def test_in_mfp_has_unit_extinction_and_the_same_albedo():
 def test_scaled_multiplies_both_coefficients_and_nothing_else():
     medium = Medium(**SCALAR).scaled(3.0)
     assert (medium.sigma_s, medium.sigma_a, medium.g, medium.eta) == (6.0, 1.5, 0.25, 1.4)
+
+
+def test_a_medium_of_tensors_has_the_texts_of_its_numbers_and_equals_no_other():
+    torch = pytest.importorskip("torch")
+    sigma_s = torch.tensor([1.0, 2.0], dtype=torch.float64, requires_grad=True)
+    medium, other, numbers = Medium(sigma_s, 0.1), Medium(sigma_s, 0.1), Medium([1.0, 2.0], 0.1)
+    assert medium.detached() == numbers and numbers.detached() is numbers
+    assert str(medium) == str(numbers) and medium._repr_html_() == numbers._repr_html_()
+    assert medium == medium and medium != other and numbers != medium and len({medium, other, numbers, medium}) == 3
+    for made in (Medium.from_reduced(sigma_s, 0.1), Medium.from_albedo(sigma_s / 4, 2.0), medium.scaled(2).in_mfp()):
+        (slope,) = torch.autograd.grad(made.channel(1).albedo, sigma_s)
+        assert slope[0] == 0 < slope[1]
+    for refused in ({"eta": sigma_s[0]}, {"sigma_s": -sigma_s}, {"sigma_s": [sigma_s[0], sigma_s[1]]}):
+        with pytest.raises(ValueError, match=f"{next(iter(refused))} must be"):
+            Medium(**{"sigma_s": 1.0, "sigma_a": 0.1, **refused})
+    for lost in (medium.reflectance, lambda: halfspace_sss.trace(medium.channel(0), 10)):
+        with pytest.raises(ValueError, match="medium must be of numbers"):
+            lost()
 
 
 def test_equal_media_are_equal_and_hash_alike():
