@@ -13,7 +13,16 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import uniform_filter
 
-from full_geometry.geometry.sensors import checked_samples, path_numbers, rays_by, sampled_size, seeded, splat, widened
+from full_geometry.geometry.sensors import (
+    checked_samples,
+    path_numbers,
+    rays_by,
+    sampled_size,
+    seeded,
+    seeded_sampler,
+    splat,
+    widened,
+)
 from full_geometry.geometry.shape import SceneMark
 from full_geometry.geometry.snapshot import Snapshot, same_objects
 from full_geometry.integrators.bssrdf import Launch, is_independent, undisturbed
@@ -354,8 +363,9 @@ def _launch(
     glints: mi.UInt32 | None = None,
 ) -> None:  # fmt: skip
     """Trace the rays of a launch and add them to the film, with derivatives if `scored`."""
-    # numbers of low discrepancy go on from launch to launch
-    sampler = launch.sampler(sensor, seeded(*(seed[:1] if is_independent(sensor.sampler()) else seed)))
+    # with precomputed light places in a pixel are its noise: numbers of low discrepancy go on from launch to launch
+    even = tracer.visitor.unscattered is not None and is_independent(sensor.sampler())
+    sampler = launch.sampler(sensor, seeded(seed[0])) if even else seeded_sampler(sensor, launch.spp, seeded(*seed))
     rays, weight, position = rays_by(sensor, sampler)
     spp = sampler.sample_count()
     rays = tracer.shown(rays)

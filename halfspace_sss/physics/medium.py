@@ -120,9 +120,10 @@ class Medium:
             sigma_s + sigma_a is outside [1e-18, 1e18], as 0 is (a mean free path would be infinite).
     """
 
-    sigma_s: Real
-    sigma_a: Real
-    g: Real = 0.0
+    # or tensors: Dr.Jit resolves the hints of what a scene holds, and torch is not imported there
+    sigma_s: np.ndarray | float
+    sigma_a: np.ndarray | float
+    g: np.ndarray | float = 0.0
     eta: float = 1.3
 
     def __post_init__(self) -> None:
