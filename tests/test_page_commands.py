@@ -176,7 +176,7 @@ def _lay_out(page: str, folder: Path) -> None:
         (folder / "toy.xml").write_text(_of_kind(page, "xml"))
         shutil.copy(ROOT / "docs" / "scenes" / "toy.ply", folder)
         shutil.copy(ROOT / "figures" / "assets" / "studio.exr", folder / "sky.exr")
-        Image.new("RGB", (8, 8), (200, 140, 120)).save(folder / "skin.png")
+        Image.frombytes("RGB", (2, 1), bytes([200, 140, 120, 90, 60, 200])).save(folder / "skin.png")
     elif page == "docs/inverse.md":
         scene = _of_kind(page, "xml")
         truth = scene.replace('name="albedo" value="0.8"', 'name="albedo" value="0.97, 0.93, 0.8"')

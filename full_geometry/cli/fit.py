@@ -59,7 +59,7 @@ def fit(
     scene: Annotated[
         Path, typer.Argument(help="Mitsuba XML or glTF file with the cameras, the lights and a first medium.")
     ],
-    images: Annotated[Path, typer.Option(help="JSON file of the views, see `full_geometry.inverse.read_views`.")],
+    images: Annotated[Path, typer.Option(help="JSON file of the views: image, sensor or camera, mask.")],
     fitted: FittedOptions,
     descent: DescentOptions,
     work: Annotated[Path | None, typer.Option(help="Folder where an interrupted fit goes on.")] = None,

@@ -72,8 +72,8 @@ class TransportOptions:
     light: Annotated[
         str | None,
         typer.Option(
-            help="Models: sampled (no bias), gathered (little bias, no noise of orders from two on), corrected "
-            "(gathered, less the bias of the model that walks find) or auto. "
+            help="Models: sampled (adds no bias), gathered (little bias, no noise of orders from two on), corrected "
+            "(gathered; walks take most of the model's bias away) or auto. "
             "path_traced: precomputed (bias below .3 %), sampled or auto.",
             show_default="models: sampled; path_traced: auto; or the scene's",
         ),

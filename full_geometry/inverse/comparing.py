@@ -152,8 +152,8 @@ class ChiSquare(NamedTuple):
             return []
         return [
             f"noise does not explain the residuals ({(self.value - 1) / self.error:.0f} standard errors): lights, "
-            "cameras, exposures, shape, index or boundary of the scene differ from the images', or steps are too "
-            "few; the stated errors leave that out"
+            "cameras, exposures, shape, index or boundary of the scene are not those of the images, or steps are too "
+            "few; the errors above do not include this"
         ]
 
 
@@ -233,11 +233,11 @@ class MaterialFit:
             told.append(f"{name}: {size} numbers of mean {mean}, median of their errors {known}")
         held = "" if self.held_out is None else f", of views held out {self.held_out.told()} %"
         word, chi_square = "misfit" if self.is_misfit else "noise", self.chi_square
-        residuals = f"residuals: {word}, chi-square {chi_square.value:.2f}, by noise 1 ± {chi_square.error:.1g}"
+        residuals = f"residuals: {word}, chi-square {chi_square.value:.2f}, noise gives 1 ± {chi_square.error:.1g}"
         if held:
             medians = (np.median([v.relative_l1 for v in self.views if v.held_out == out]) for out in (False, True))
             held += ", median relative L1 of views {:.1%}, of those held out {:.1%}".format(*medians)
-        return [*told, f"root of the loss {self.misfit.told()} %{held}", residuals]
+        return [*told, f"weighted RMS residual {self.misfit.told()} %{held}", residuals]
 
 
 class ViewMisfit(NamedTuple):

@@ -325,7 +325,7 @@ class MediumDescent:
             return []
         return [
             f"all renders times {np.exp(step):.3g} ± {np.exp(step) * error:.1g}, with another medium, would fit "
-            "better: check exposures of the images and the power of the lights; the stated errors leave that out"
+            "better: check exposures of the images and the power of the lights; the errors above do not include this"
         ]
 
     def _render(self, which: int, k: int, purpose: str, sloped: bool) -> tuple[np.ndarray, np.ndarray | None]:

@@ -375,8 +375,8 @@ def mean_ratios(scene: mi.Scene, image: np.ndarray, sensor: int = 0, seed: int =
 def told(ratios: list[MeanRatio], model: str) -> list[str]:
     """A sentence for each object that is off by more than LEAST and three standard errors."""
     return [
-        f"{model} is off: {f'object {r.object!r}' if r.object else 'the object'} has {r.value:.2f} ± {r.error:.2f} of "
-        f"the light of {WALKS} random walks; --model path_traced has no such error"
+        f"{model} makes {f'object {r.object!r}' if r.object else 'the object'} {r.value:.2f} ± {r.error:.2f} times as "
+        f"bright as {WALKS} random walks do; --model path_traced has no such error"
         for r in ratios
         if abs(r.value - 1) > max(LEAST, 3 * r.error)
     ]

@@ -72,8 +72,8 @@ class Denoised(NamedTuple):
     def told(self) -> str:
         """The error as a sentence."""
         if not math.isfinite(self.error):
-            return "denoised: one pass has no estimate of its error"
-        return f"denoised: {self.error:.2%} ± {self.standard_error:.2%} off, with the bias of the denoiser"
+            return "error of the denoised image: not known after one pass"
+        return f"error of the denoised image {self.error:.2%} ± {self.standard_error:.2%}, bias of denoising included"
 
 
 class Halves(NamedTuple):

@@ -65,7 +65,7 @@ def test_a_denoised_image_lies_beside_the_other_and_on_the_page(scene: Path) -> 
     noisy = reference.load(out / "ball_scene.exr").mean
     clean = np.array(mi.Bitmap(str(out / "ball_scene.denoised.exr")))
     assert np.sum((clean - truth) ** 2) < np.sum((noisy - truth) ** 2)
-    assert re.search(r"denoised: [\d.]+% ± [\d.]+% off, with the bias of the denoiser", result.stdout)
+    assert re.search(r"error of the denoised image [\d.]+% ± [\d.]+%, bias of denoising included", result.stdout)
     assert len(re.findall("data:image/", (out / "ball_scene.html").read_text())) == 2
 
 
