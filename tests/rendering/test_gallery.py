@@ -41,15 +41,14 @@ def test_every_scene_has_a_test() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("file", CORRECTED)
 def test_corrected_light_has_the_mean_of_walks_within_its_error(file: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An error is told of a point; that of the mean of an object is less than half of it."""
+    """An error is told of a point; means of objects are nearer."""
     monkeypatch.setattr(gathering, "DIRECTIONS", 2**16)
     scene = _scene(file, "better_dipole", "corrected")
     found, _ = _mean(scene, 32, 2)
     (told,) = (float(line.split("about ")[1].split("%")[0]) / 100 for line in scene.integrator().gathered)
     walked, error = _mean(_scene(file, "path_traced", "auto"), 48)
-    assert 0.01 < told < 0.15
-    assert (error < 0.03 * walked).all()
-    assert (np.abs(found - walked) < 0.5 * told * walked + 4 * error).all(), (found / walked, error / walked, told)
+    assert 0.01 < told < 0.25 and (error < 0.03 * walked).all()
+    assert (np.abs(found - walked) < min(0.5 * told, 0.05) * walked + 4 * error).all(), (found / walked, told)
 
 
 @pytest.mark.slow
