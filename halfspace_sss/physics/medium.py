@@ -139,6 +139,7 @@ class Medium:
             raise ValueError("sigma_s must have at least one channel, got none")
         for name, value in fields.items():
             if is_torch(lib):
+                _check(name, value, (value > 0) | (name != "sigma_a"), "> 0 for gradients: roots of it have none at 0")
                 object.__setattr__(self, name, value.broadcast_to(shape))
                 continue
             value = np.broadcast_to(value, shape)

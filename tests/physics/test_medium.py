@@ -88,7 +88,12 @@ def test_a_medium_of_tensors_has_the_texts_of_its_numbers_and_equals_no_other():
     for made in (Medium.from_reduced(sigma_s, 0.1), Medium.from_albedo(sigma_s / 4, 2.0), medium.scaled(2).in_mfp()):
         (slope,) = torch.autograd.grad(made.channel(1).albedo, sigma_s)
         assert slope[0] == 0 < slope[1]
-    for refused in ({"eta": sigma_s[0]}, {"sigma_s": -sigma_s}, {"sigma_s": [sigma_s[0], sigma_s[1]]}):
+    for refused in (
+        {"eta": sigma_s[0]},
+        {"sigma_s": -sigma_s},
+        {"sigma_s": [sigma_s[0], sigma_s[1]]},
+        {"sigma_a": 0 * sigma_s},
+    ):
         with pytest.raises(ValueError, match=f"{next(iter(refused))} must be"):
             Medium(**{"sigma_s": 1.0, "sigma_a": 0.1, **refused})
     for lost in (medium.reflectance, lambda: halfspace_sss.trace(medium.channel(0), 10)):
