@@ -165,7 +165,8 @@ def _samples(scene: mi.Scene | tuple[mi.Scene, ...], seconds: float, seed: int) 
     """Samples of a pixel, a power of two, that take at most so many CPU seconds, but not half as many; at least one."""
     spp = 1
     _passes(scene, 0.0, spp, seed)  # compiles
-    while _passes(scene, 0.0, 2 * spp, seed + spp)[1][0] < seconds and spp < MOST_SPP:
+    # the first pass of so many samples may compile
+    while spp < MOST_SPP and min(_passes(scene, 0.0, 2 * spp, seed + spp + k)[1][0] for k in range(2)) < seconds:
         spp *= 2
     return spp
 
