@@ -18,8 +18,9 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from benchmarks.bench import Row
+from full_geometry.cli.variants import use_mitsuba
 
-# object, light: as the issue of every user of a GPU, three shapes and three media
+# object and light: three shapes, three media
 WALKED = (("hand of potato", "windows"), ("ribbon of cream", "lamp and sky"), ("bunny of marble", "windows"))
 EDITED = "bunny of marble", "windows"
 FIRST = ("better_dipole, gathered", "better_dipole, corrected", "walk", "full_geometry, gathered")
@@ -27,20 +28,6 @@ WALKS, LEARNT = "walk", "full_geometry, sampled"
 SPP, LEARNT_SPP = 64, 16  # of an image
 PASSES, TRAINING = 6, 10.0  # images of a way; seconds of a training
 PATIENCE = 600.0  # seconds for a first image
-
-
-def use_variant(variant: str) -> None:
-    """Mitsuba under a variant, with our plugins."""
-    from halfspace_sss.backend import prepare_llvm
-
-    if variant.startswith("llvm"):
-        prepare_llvm()
-    import mitsuba as mi
-
-    import full_geometry
-
-    mi.set_variant(variant)
-    full_geometry.register()
 
 
 def bench_renders(variant: str, size: int, training: float = 0.0, spp: int = SPP) -> Iterator[Row]:
@@ -56,7 +43,7 @@ def bench_renders(variant: str, size: int, training: float = 0.0, spp: int = SPP
         training: seconds that `full_geometry` learns each object, of which light is then sampled; 0 takes walks.
         spp: samples of a pixel in each of `PASSES` images, of a learnt object 16 at most.
     """
-    use_variant(variant)
+    use_mitsuba(variant)
     from benchmarks.speeds import VOLUMES, LitObject, scene_of, train
     from benchmarks.total_error import PRECOMPUTED, image_of_pass, lit_scene
     from full_geometry.trade.denoising import cover
@@ -107,7 +94,7 @@ def bench_edits(variant: str, size: int) -> Iterator[Row]:
 
     A row has a way, the seconds of the first image of a scene whose kernels are known, and of the next ones.
     """
-    use_variant(variant)
+    use_mitsuba(variant)
     import mitsuba as mi
 
     from benchmarks.speeds import LitObject
@@ -166,7 +153,7 @@ def bench_first_images(variant: str, size: int, training: float = TRAINING) -> I
 
     Imports, the scene and the image of 16 samples a pixel count; a `full_geometry` is trained before.
     """
-    use_variant(variant)
+    use_mitsuba(variant)
     from benchmarks.speeds import LitObject, train
 
     with TemporaryDirectory() as weights:
@@ -196,7 +183,7 @@ def _first(variant: str, size: int, way: str, home: str, weights: str) -> float:
 
 def first_image(variant: str, size: int, way: str, folder: str) -> None:
     """One image of `EDITED`, as a process of its own makes it."""
-    use_variant(variant)
+    use_mitsuba(variant)
     import mitsuba as mi
 
     from benchmarks.speeds import LitObject

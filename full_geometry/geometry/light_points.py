@@ -28,6 +28,7 @@ from full_geometry.geometry.points import (
     cosine_above,
     floats,
     lifted,
+    of_rows,
     opaque,
 )
 from full_geometry.geometry.shape import Geometry
@@ -113,10 +114,12 @@ class SurfacePoints:
                 others = np.array(others)
                 left[others[n[others] @ n[k] > 0.5]] = False
         chosen, old = missed[kept], (self.p, self.n, self.n_out, self.face)
-        p, n, n_out, face = (
-            type(a)(np.concatenate([np.array(a), np.array(b)[..., chosen]], axis=-1))
+        joined = [
+            np.concatenate([np.array(a), np.array(b)[..., chosen]], axis=-1)
             for a, b in zip(old, (at.p, at.n, at.n_out, at.face))
-        )
+        ]
+        p, n, n_out = (of_rows(type(a), values.T) for a, values in zip(old, joined[:3]))
+        face = aligned(mi.UInt32, joined[3])
         return SurfacePoints(p, n, n_out, face, *_grid(np.array(p).T, self.h))
 
     def __len__(self) -> int:

@@ -481,7 +481,7 @@ def _odd_share(geometry: Geometry, points: np.ndarray, n: int) -> np.ndarray:
     along = np.random.default_rng(11).standard_normal((3, n))
     along /= np.linalg.norm(along, axis=0)
     start, ends = np.repeat(points, n, axis=1), np.tile(along, points.shape[1])
-    _, count = crossings(geometry.scene, mi.Ray3f(mi.Point3f(start), mi.Vector3f(ends)))
+    _, count = crossings(geometry.scene, ray_of_arrays(start, ends))
     return (np.array(count) % 2).reshape(-1, n).mean(axis=1)
 
 
@@ -572,11 +572,16 @@ def groups_of(scene: mi.Scene) -> list[mi.Shape]:
     return [node for node in mi.traverse(scene).hierarchy if node.class_name() == "ShapeGroupPlugin"]
 
 
+def ray_of_arrays(o: np.ndarray, d: np.ndarray) -> mi.Ray3f:
+    """Rays from origins and directions of shape (3, n)."""
+    return mi.Ray3f(*(kind(*(aligned(mi.Float, v) for v in x)) for kind, x in ((mi.Point3f, o), (mi.Vector3f, d))))
+
+
 def rays_into(box: mi.ScalarBoundingBox3f, n: int) -> mi.Ray3f:
     """Rays from about a bounding box to places in it."""
     ends = (np.array(end, dtype=float).reshape(1, 3) for end in (box.min, box.max))
     (start,), (along,) = ways_into(*ends, n)
-    return mi.Ray3f(mi.Point3f(start), mi.Vector3f(along))
+    return ray_of_arrays(start, along)
 
 
 def ways_into(low: np.ndarray, high: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -599,7 +604,7 @@ def lines_through(box: mi.ScalarBoundingBox3f, n: int) -> mi.Ray3f:
     aside -= (aside * d).sum(axis=0) * d
     aside *= np.sqrt(rng.random(n)) / np.linalg.norm(aside, axis=0)
     start = 0.5 * (low + high)[:, None] + 0.5 * np.linalg.norm(high - low) * (aside - 1.01 * d)
-    return mi.Ray3f(mi.Point3f(start), mi.Vector3f(d))
+    return ray_of_arrays(start, d)
 
 
 def check_together(world: mi.Scene, scenes: list[mi.Scene]) -> None:

@@ -47,6 +47,7 @@ from full_geometry.walk.media import WalkMedia
 from full_geometry.walk.random_walk import PATH_LANES, on_device
 from full_geometry.walk.scores import PathScores, with_derivatives
 from full_geometry.walk.straight_light import find_straight_light
+from halfspace_sss.arrays import aligned
 from halfspace_sss.backend import clock
 from halfspace_sss.checks import check_choice, check_interval
 from halfspace_sss.interrupts import checkpoint, interruptible
@@ -416,15 +417,8 @@ def _glints(tracer: PathTracer, sensor: mi.Sensor, seed: int, spp: int) -> mi.UI
     if tracer.visitor.unscattered is None or not film.rfilter().is_box_filter():
         return None
 
-    # ---- the mean square of other light
     width, height = (int(v) for v in sampled_size(film))
-    pixels = mi.UInt32(np.linspace(0, width * height - 1, LIT_RAYS).astype(np.uint32))
-    rays, weight, _ = rays_by(sensor, path_numbers(seeded(seed, 2), LIT_RAYS, 0, 1), pixels)
-    apart = dr.full(mi.Bool, True, LIT_RAYS)
-    dr.eval(apart)
-    L, hit, _ = replace(tracer, apart=apart).trace(tracer.shown(rays), on_device(PATH_LANES), (seed, 2))
-    light = np.array(weight * L, dtype=float)[:, np.array(hit)]
-    least = GLINT * float((light**2).sum() / max(light.shape[1], 1))
+    least = None
 
     # ---- the variance of that emission over a pixel and its neighbours, by more rays where one in each has found some
     for trial in (1, max(1, min(spp // 8, TRIALS))):
@@ -434,10 +428,24 @@ def _glints(tracer: PathTracer, sensor: mi.Sensor, seed: int, spp: int) -> mi.UI
         found = found.reshape(-1, height, width, trial)
         squares, means = (uniform_filter(v.mean(axis=3), (0, 3, 3)) for v in (found**2, found))
         variance = (squares - means**2).sum(axis=0).ravel()
+        if least is None:  # other light is not asked for where nothing is seen
+            least = GLINT * _other_light(tracer, sensor, seed) if found.any() else np.inf
         number = min(int(np.count_nonzero(variance > least)), len(variance) // GLINTS)
         if number == 0:
             break
-    return mi.UInt32(np.sort(np.argsort(variance)[len(variance) - number :]).astype(np.uint32))
+    return aligned(mi.UInt32, np.sort(np.argsort(variance)[len(variance) - number :]))
+
+
+def _other_light(tracer: PathTracer, sensor: mi.Sensor, seed: int) -> float:
+    """The mean square of the light of objects without the emission seen in them."""
+    pixels = int(dr.prod(sampled_size(sensor.film())))
+    pixels = aligned(mi.UInt32, np.linspace(0, pixels - 1, LIT_RAYS).astype(np.uint32))
+    rays, weight, _ = rays_by(sensor, path_numbers(seeded(seed, 2), LIT_RAYS, 0, 1), pixels)
+    apart = dr.full(mi.Bool, True, LIT_RAYS)
+    dr.eval(apart)
+    L, hit, _ = replace(tracer, apart=apart).trace(tracer.shown(rays), on_device(PATH_LANES), (seed, 2))
+    light = np.array(weight * L, dtype=float)[:, np.array(hit)]
+    return float((light**2).sum() / max(light.shape[1], 1))
 
 
 def _scale(name: str, value: float) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 
 from full_geometry.geometry.instances import InstanceTable, corners, ends_of, shapes_of, shown_groups
 from full_geometry.geometry.points import floats
-from full_geometry.geometry.shape import Geometry, is_inside, meet_alone, name_of, scene_of, ways_into
+from full_geometry.geometry.shape import Geometry, is_inside, meet_alone, name_of, ray_of_arrays, scene_of, ways_into
 from full_geometry.surface.sheets import is_sheet
 from full_geometry.surface.wrapped import surface_of
 
@@ -175,7 +175,7 @@ def _points_in(alone: mi.Scene, pairs: _Pairs) -> tuple[np.ndarray, np.ndarray]:
     start, along = inverse[:, :3, :3] @ start + inverse[:, :3, 3:], inverse[:, :3, :3] @ along
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     o, d = (np.moveaxis(v, 0, 1).reshape(3, -1) for v in (start, along))
-    si = meet_alone(alone, mi.Ray3f(mi.Point3f(o), mi.Vector3f(d)), mi.RayFlags.Minimal)
+    si = meet_alone(alone, ray_of_arrays(o, d), mi.RayFlags.Minimal)
     met = np.moveaxis(np.where(si.is_valid(), np.array(si.p, dtype=float), 0).reshape(3, n, -1), 0, 1)
     drawn = np.broadcast_to(points := _points_by_area(alone), (n, *points.shape))
     points = pairs.thing[:, :3, :3] @ np.concatenate([met, drawn], axis=2) + pairs.thing[:, :3, 3:]
@@ -212,7 +212,7 @@ def _reach_deep(pairs: _Pairs, alone: mi.Scene, holder: Geometry) -> np.ndarray:
         along = np.random.default_rng(17).standard_normal((3, 128))
         along /= np.linalg.norm(along, axis=0)
         start, ends = np.repeat(points[:, inside], 128, axis=1), np.tile(along, len(inside))
-        hit = holder.scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(start), mi.Vector3f(ends)))
+        hit = holder.scene.ray_intersect_preliminary(ray_of_arrays(start, ends))
         scale = np.cbrt(np.abs(np.linalg.det(pairs.holder[k[inside], :3, :3])))
         result[k[inside][scale * np.array(hit.t).reshape(-1, 128).min(axis=1) > pairs.deep[k[inside]]]] = True
     return result
@@ -271,7 +271,7 @@ def _shares(shape: mi.Shape, other: mi.Scene, into: np.ndarray, close: np.ndarra
     p, n = into[:, :3, :3] @ p + into[:, :3, 3:], np.moveaxis(np.linalg.inv(into[:, :3, :3]), 1, 2) @ n
     n /= np.linalg.norm(n, axis=1, keepdims=True)
     o, d = (np.moveaxis(v, 0, 1).reshape(3, -1) for v in (p - n * close[:, None, None], n))
-    ray = mi.Ray3f(mi.Point3f(o), mi.Vector3f(d))
+    ray = ray_of_arrays(o, d)
     ray.maxt = floats(np.repeat(2 * close, p.shape[2]))
     si = other.ray_intersect(ray, mi.RayFlags.Minimal, False)
     on = np.array(si.is_valid() & (dr.abs(dr.dot(si.n, ray.d)) > 0.99))

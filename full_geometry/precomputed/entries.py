@@ -68,7 +68,7 @@ class StratifiedEntries:
         # ---- entry s is where the cumulative sum passes (s + shift) W / n; its weight is W A / (f N)
         shift = np.empty(count, dtype=np.float32)  # neighbours have places between those of each other
         shift[order] = (np.arange(count) * GOLDEN + rng.random()) % 1.0
-        shift, lanes = mi.Float(shift), dr.arange(mi.UInt32, count) * n
+        shift, lanes = floats(shift), dr.arange(mi.UInt32, count) * n
         chosen, weight = dr.zeros(mi.UInt32, count * number), dr.zeros(mi.Float, count * number)
         dr.eval(whole, chosen, weight)
         step, area = whole / mi.Float(n), opaque(positions.geometry.area / PLACES)

@@ -261,7 +261,7 @@ class TransportMatrix:
         toward, step, t, unit = (
             v.reshape(-1, *v.shape[2:])[lit.number] for v in (self.toward, self.step, self.t, self.unit)
         )
-        found = unit * S / np.maximum(np.array(self.albedo(mi.Float(mu))).T, self.albedo.least)
+        found = unit * S / np.maximum(np.array(self.albedo(floats(mu))).T, self.albedo.least)
 
         # ---- t' - t (1 + g.w), times the light along w
         n, g, row = self._n_out[point], self.g[step], lit.row
@@ -729,7 +729,7 @@ def _tilted(albedo: Albedo, mu: np.ndarray, S: np.ndarray, paint: np.ndarray) ->
     """a(mu) with c that varies with the reflectance: by least squares over S of points, (points, samples, channels)."""
     # x = ln R, and S of each point scaled to the sum that a without tilt gives
     step, x = max(mu.size // FITTED, 1), np.log(np.maximum(paint, 1e-20))
-    even = np.array(albedo(mi.Float(mu.ravel()))).T.reshape(S.shape).sum(axis=1) / np.maximum(S.sum(axis=1), 1e-30)
+    even = np.array(albedo(floats(mu))).T.reshape(S.shape).sum(axis=1) / np.maximum(S.sum(axis=1), 1e-30)
     mu, y = mu[:, ::step].astype(float), S[:, ::step] * even[:, None]
     powers, middle = F_t(mu, albedo.eta)[:, :, None] * mu[:, :, None] ** np.arange(3), x.mean(axis=0)
 

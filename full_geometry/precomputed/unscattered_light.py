@@ -58,7 +58,7 @@ FEWEST_POINTS, MOST_POINTS = 2**14, 2**18  # of the surface that find its cells,
 MOST_INTEGER = 2**15 - 1  # of 16 bits, for a direction of 1
 MOST_TRUNCATED = 0.5  # abs(g) of media that vary or have textures, above which three coefficients are too few
 FEWEST_PATHS = 2**14  # of scattered light, from each object
-THIN = 8.0
+THIN = 8.0  # mean free paths of the mean chord, below which emitters are looked for behind an object
 ROULETTE = 0.1  # part of its light below which a reflected ray may end
 
 
@@ -166,7 +166,9 @@ def unscattered_light(
     index = CellIndex(_joined(bricks), _joined(slots))
     light = _joined(fluence), _joined(directions) if directional else None
     dr.make_opaque(tables, index, light)
-    found = UnscatteredLight(index, *light, tables, forward(media), any(_thin(media, k) for k in range(len(cells))))
+    extinctions = [float(np.min(_extinction(media, kind))) for kind in media.instance_table.kind]
+    thin = any(grid.chord * extinction < THIN for grid, extinction in zip(cells, extinctions))
+    found = UnscatteredLight(index, *light, tables, forward(media), thin)
     if paths:
         found = replace(found, scattered=_scattered(scene, media, seed, found, cells, paths))
     dr.sync_thread()  # callers time this
@@ -255,8 +257,9 @@ def inside_cells_of(media: WalkMedia) -> list[InsideCells]:
     results = []
     for k in range(len(media.instance_table.kind)):
         box, h, depths = _grid(media, k)
-        points = partial(_surface_points, media, k, _extent(media, k)[0])
-        results.append(InsideCells.of(media, k, points, box, h, depths))
+        area, volume = _extent(media, k)
+        points = partial(_surface_points, media, k, area)
+        results.append(InsideCells.of(media, k, points, box, h, depths, 4 * volume / area))
     return results
 
 
@@ -271,12 +274,6 @@ def _grid(media: WalkMedia, k: int) -> tuple[tuple[np.ndarray, np.ndarray], floa
     fine = max(4 * volume / (area * ACROSS), (volume / FINE_CELLS) ** (1 / 3))
     h = min(edge / float(np.mean(extinction)), fine or np.inf)
     return box, cell_edge(box, (area, volume), h, depths), depths
-
-
-def _thin(media: WalkMedia, k: int) -> bool:
-    """Whether the mean chord of object k, 4 V / A, is below THIN mean free paths."""
-    area, volume = _extent(media, k)
-    return 4 * volume / area * float(np.min(_extinction(media, media.instance_table.kind[k]))) < THIN
 
 
 def _extent(media: WalkMedia, k: int) -> tuple[float, float]:

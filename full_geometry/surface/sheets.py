@@ -19,11 +19,12 @@ import mitsuba as mi
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from full_geometry.geometry.points import opaque
+from full_geometry.geometry.points import floats, opaque
 from full_geometry.geometry.shape import name_of
 from full_geometry.settings import check_parameters
 from full_geometry.surface.textured import TexturedMedium
 from full_geometry.surface.translucent import PARAMETERS, boundary_of, is_smooth_boundary, read_medium_spec
+from halfspace_sss.arrays import library
 from halfspace_sss.checks import check_interval
 from halfspace_sss.physics.fresnel import F_r, F_t, mu_internal
 from halfspace_sss.physics.medium import Medium, eval_hg, sample_hg
@@ -76,7 +77,7 @@ class SlabTable:
 
 
 def _tensor(values: list[np.ndarray]) -> mi.TensorXf:
-    return mi.TensorXf(np.maximum(values, 0).astype(np.float32))
+    return mi.TensorXf(floats(np.maximum(values, 0)), np.shape(values))
 
 
 class Sheet:
@@ -162,7 +163,7 @@ class Sheet:
         for k, albedo in enumerate(self.albedos(si, active)):
             t, more = self.depth[k], self.tables[k].more(*at, azimuth, self._at(k, albedo))
             # K_r = a p (1 - e^(-t (1/i + 1/o))) / (i + o), K_t = a p (e^(-t/o) - e^(-t/i)) / (o - i)
-            back = -expm1(-t * (dr.rcp(i) + dr.rcp(o))) / (i + o)
+            back = -library(t).expm1(-t * (dr.rcp(i) + dr.rcp(o))) / (i + o)
             x = t * (o - i) / (i * o)
             through = t * dr.exp(-t / dr.maximum(i, o)) / (i * o) * _mean_decay(dr.abs(x))
             once = albedo * eval_hg(cosine, self.phase[k]) * dr.select(same, back, through)
@@ -206,14 +207,9 @@ class Sheet:
         return (1 - share) * side * mu * dr.inv_pi + share * by_phase
 
 
-def expm1(x: mi.Float) -> mi.Float:
-    """exp(x) - 1 with its digits near 0."""
-    return dr.select(dr.abs(x) < 1e-2, x * (1 + x * (0.5 + x / 6)), dr.exp(x) - 1)
-
-
 def _mean_decay(x: mi.Float) -> mi.Float:
     """(1 - e^-x) / x for x >= 0."""
-    return dr.select(x < 1e-2, 1 - x * (0.5 - x / 6), (1 - dr.exp(-x)) / dr.maximum(x, 1e-6))
+    return dr.select(x < 1e-6, 1, -library(x).expm1(-x) / dr.maximum(x, 1e-6))
 
 
 def sheet_class() -> type:
