@@ -748,8 +748,10 @@ class PathTracer:
         self, L: mi.Spectrum, p: CameraPath, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32, active: mi.Bool
     ) -> tuple[Seen, Seen, mi.Spectrum, CameraPath]:
         """What object k mirrors, and what is seen through it, and the light with both, at first told apart."""
+        # emission that rays find lacks delta lights: where a path has scattered, it meets their cones instead
         small = self.visitor.small
-        through = active & ~p.light.scattered if small is not None and small.n_delta else active
+        active = active & ~p.light.scattered if small is not None and small.n_delta else active
+        through = active
         if not self.passes:
             through = through & (p.depth > 1)
         mirrored, behind = self.visitor.seen_emitters(p.walk, si, bsdf, k, active, through)

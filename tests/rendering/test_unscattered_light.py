@@ -366,3 +366,29 @@ def test_path_traced_is_the_walk_with_the_light_that_is_asked_for(light: str) ->
 def test_a_light_that_does_not_exist_is_refused() -> None:
     with pytest.raises((ValueError, RuntimeError), match="light must be one of auto, precomputed, sampled, got 'grid'"):
         mi.load_dict({"type": "translucent_walk", "light": "grid"})
+
+
+def test_a_floor_has_the_light_of_a_delta_light_in_the_mirror_of_an_object() -> None:
+    """A spot that shines on a cube alone: its mirror image is met by cones about the light, wide ones here."""
+    T = mi.ScalarTransform4f()
+    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}, "component_format": "float32"}
+    view = T.look_at([0, 6, 8], [0, -1, 1], [0, 1, 0])
+    aim = T.look_at([0, 0.5, 5], [0, 0, 1], [0, 1, 0])
+    floor = T.translate([0, -1.05, 0]).rotate([1, 0, 0], -90).scale(6)
+    found, wanted = (
+        independent(
+            mi.load_dict(
+                {
+                    "type": "scene", "integrator": {"type": "translucent_walk", "light": how, "blur": 8.0},
+                    "sensor": {"type": "perspective", "fov": 40.0, "to_world": view, "film": film},
+                    "spot": {"type": "spot", "to_world": aim, "cutoff_angle": 12.0, "intensity": 100.0},
+                    "floor": {"type": "rectangle", "to_world": floor, "bsdf": {"type": "diffuse", "reflectance": 0.8}},
+                    "cube": {"type": "cube", "to_world": T.scale([3, 1, 1]),
+                             "bsdf": {"type": "translucent", "sigma_s": 0.01, "sigma_a": 20.0, "eta": 3.0}},
+                }
+            ), 8, 1024, seed,
+        )[..., 0].mean(axis=(1, 2))
+        for how, seed in (("precomputed", 1), ("sampled", 101))
+    )  # fmt: skip
+    error = np.hypot(*(x.std(ddof=1) / np.sqrt(len(x)) for x in (found, wanted)))
+    assert abs(found.mean() - wanted.mean()) < WIDEST_Z * error < 0.5 * wanted.mean(), (found, wanted)
