@@ -139,6 +139,11 @@ def opaque(value: float) -> mi.Float:
     return dr.opaque(mi.Float, float(value))
 
 
+def lane_numbers(n: int) -> mi.UInt32:
+    """Numbers 0 to n - 1 that gather from arrays of any length by one kernel: plain ones have another for length n."""
+    return dr.arange(mi.UInt32, n) + dr.opaque(mi.UInt32, 0)
+
+
 def floats(values: np.ndarray) -> mi.Float:
     """`aligned` numbers in single precision."""
     return aligned(mi.Float, values)

@@ -384,7 +384,7 @@ def _launch(
     # ---- without, and with the layer of emission
     exits = FirstExits.of(tracer.visitor.scene, tracer.visitor.media, rays) if keep else None
     if glints is not None:
-        apart = dr.full(mi.Bool, False, dr.width(rays))
+        apart = dr.opaque(mi.Bool, False, dr.width(rays))  # a literal would be another kernel
         if dr.width(glints):
             lanes = dr.arange(mi.UInt32, dr.width(glints) * spp)
             lanes = dr.gather(mi.UInt32, glints, lanes // spp) * spp + lanes % spp
@@ -441,8 +441,7 @@ def _other_light(tracer: PathTracer, sensor: mi.Sensor, seed: int) -> float:
     pixels = int(dr.prod(sampled_size(sensor.film())))
     pixels = aligned(mi.UInt32, np.linspace(0, pixels - 1, LIT_RAYS).astype(np.uint32))
     rays, weight, _ = rays_by(sensor, path_numbers(seeded(seed, 2), LIT_RAYS, 0, 1), pixels)
-    apart = dr.full(mi.Bool, True, LIT_RAYS)
-    dr.eval(apart)
+    apart = dr.opaque(mi.Bool, True, LIT_RAYS)
     L, hit, _ = replace(tracer, apart=apart).trace(tracer.shown(rays), on_device(PATH_LANES), (seed, 2))
     light = np.array(weight * L, dtype=float)[:, np.array(hit)]
     return float((light**2).sum() / max(light.shape[1], 1))

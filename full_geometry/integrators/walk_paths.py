@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from full_geometry.geometry.instances import shapes_of
-from full_geometry.geometry.points import lifted, opaque, sided
+from full_geometry.geometry.points import lane_numbers, lifted, opaque, sided
 from full_geometry.geometry.rounding import ray_from
 from full_geometry.geometry.sensors import past_emitters, shows_sky
 from full_geometry.objects.small_emitters import NARROW, WIDE, SmallEmitters
@@ -584,7 +584,7 @@ class PathTracer:
 
         # ---- lanes take rays index, index + lanes, ... until none is left
         rng = generator(mi, lanes, pass_seed(*seed))
-        start = begin(dr.arange(mi.UInt32, lanes), rng)
+        start = begin(lane_numbers(lanes), rng)
         with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):  # records the loop twice, for kernels no faster
             dr.while_loop((start,), lambda p: p.index < total, body, label="paths")
             dr.eval(L, hit, emission)

@@ -66,6 +66,7 @@ def _light(environment: mi.Emitter) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     if mi.is_spectral:
         at.wavelengths = mi.Spectrum(*LOOKED_AT)
     ds, weight = environment.sample_direction(at, u)
+    dr.eval(ds.d, ds.pdf, weight)  # at once, by one kernel
     energy = np.array(mi.Spectrum(weight) + dr.zeros(mi.Float, SAMPLES**2), dtype=float).max(axis=0)
     energy = np.where(np.isfinite(energy), energy, 0)
     return np.array(ds.d, dtype=float).T, energy * np.array(ds.pdf), energy

@@ -166,7 +166,8 @@ class InsideCells:
         """
         for first in range(0, n, 4):
             # ---- four sums by the cell whose fit is shared, moments about the centre of that
-            rows = [dr.gather(mi.Float, sums, self.cut * n + first + i) for i in range(4)]
+            start = self.cut * n + dr.opaque(mi.UInt32, first)
+            rows = [dr.gather(mi.Float, sums, start + i) for i in range(4)]
             if moments:
                 rows[1:] = (row + by * rows[0] for row, by in zip(rows[1:], self.offset))
             total = [dr.zeros(mi.Float, dr.width(self.cut)) for _ in rows]
@@ -177,7 +178,7 @@ class InsideCells:
 
             # ---- given back to each
             for i, target in enumerate(total):
-                dr.scatter(sums, dr.gather(mi.Float, target, self.place), self.cut * n + first + i)
+                dr.scatter(sums, dr.gather(mi.Float, target, self.place), start + i)
             dr.eval(sums)
 
     def fit(self, D: mi.Float) -> None:
@@ -389,7 +390,8 @@ def _reached(
     x = (points.p - mi.Point3f(*(opaque(v) for v in low))) * opaque(1 / h)
     n = mi.Vector3i(*(dr.opaque(mi.Int32, int(c)) for c in counts))
     for corner in range(8):
-        cell = mi.Vector3i(dr.floor(x + mi.Vector3f(*(MARGIN if corner >> a & 1 else -MARGIN for a in range(3)))))
+        margin = mi.Vector3f(*(opaque(MARGIN if corner >> a & 1 else -MARGIN) for a in range(3)))
+        cell = mi.Vector3i(dr.floor(x + margin))
         brick = cell // BRICK
         yield cell, mi.UInt32((brick.z * n.y + brick.y) * n.x + brick.x), dr.all((cell >= 0) & (brick < n))
 
@@ -436,8 +438,8 @@ def _starts_inside(media: WalkMedia, k: int, p: mi.Point3f) -> np.ndarray:
     # three rays along the axes, slightly turned so that none runs in a face; most votes win over an unlucky edge
     votes = 0
     for axis in range(3):
-        d = dr.normalize(mi.Vector3f(*(1.0 if a == axis else 0.0137 * (a + 1) for a in range(3))))
-        number = dr.full(mi.Int32, k, dr.width(p))
+        d = dr.normalize(mi.Vector3f(*(opaque(1.0 if a == axis else 0.0137 * (a + 1)) for a in range(3))))
+        number = dr.opaque(mi.Int32, k, dr.width(p))
         _, found, leaves = _own_hit(media, number, mi.Ray3f(p, d + dr.zeros(mi.Vector3f, dr.width(p))))
         votes = votes + np.array(found & leaves).astype(int)
     return votes >= 2
@@ -453,7 +455,7 @@ def _measure(
     """
     n = len(axes)
     across_cell = COLUMNS[n >= FINE]
-    number, edge, axis = dr.full(mi.Int32, k, n), opaque(h), aligned(mi.UInt32, axes)
+    number, edge, axis = dr.opaque(mi.Int32, k, n), opaque(h), aligned(mi.UInt32, axes)
     centre = _points(cells + 0.5, low, h)
     d = mi.Vector3f(*(dr.select(axis == a, mi.Float(1), 0) for a in range(3)))
     # by the place of a cell, not by its number: rounding may add cells, and all others keep their columns

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import mitsuba as mi
 
-from full_geometry.geometry.points import opaque, sided
+from full_geometry.geometry.points import lane_numbers, opaque, sided
 from full_geometry.precomputed.lit_points import bend, lit_points
 from full_geometry.walk.media import WalkMedia
 from full_geometry.walk.random_walk import (
@@ -135,7 +135,7 @@ class ScatteredLight:
             (walk,) = dr.if_stmt((walk,), walk.alive & (walk.object < 0), self._outside, _same, label="outside")
             return dr.if_stmt((walk, index, path), ~walk.alive, renew, _same, label="renew")
 
-        index = dr.arange(mi.UInt32, lanes)
+        index = lane_numbers(lanes)
         walk, path = begin(index, generator(mi, lanes, pass_seed(*seed, 2)))
         dr.while_loop((walk, index, path), lambda walk, index, path: index < total, body, label="paths of light")
         dr.eval(self.D)

@@ -475,7 +475,7 @@ def _moments(
     n = len(mi.Spectrum(0))
     D = dr.zeros(mi.Float, grid.slots * n * 4)
     w = dr.zeros(mi.Float, grid.slots * n * 8) if directional else None
-    traced = _Rays(scene, media, dr.full(mi.Int32, k, rays), grid, D, w, forward(media))
+    traced = _Rays(scene, media, dr.opaque(mi.Int32, k, rays), grid, D, w, forward(media))
     start = traced.enter(k, rays, seed)
     dr.while_loop((start,), lambda ray: ray.alive, lambda ray: (traced.segment(ray),), label="rays of light")
     dr.eval(D, w)

@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol, TypeVar
 import drjit as dr
 import mitsuba as mi
 
-from full_geometry.geometry.points import SurfacePoint, channel_mean, evaluate, lift, sided, surface_point
+from full_geometry.geometry.points import SurfacePoint, channel_mean, evaluate, lane_numbers, lift, sided, surface_point
 from full_geometry.surface.textured import MediumAt
 from full_geometry.walk.media import Coefficients, WalkMedia, WalkMedium, ray_of
 from full_geometry.walk.priorities import OUTSIDE
@@ -589,7 +589,7 @@ def walk_from(
 
     # ---- one loop over all walks
     seeds = seed if isinstance(seed, tuple) else (seed,)
-    index = dr.arange(mi.UInt32, lanes)
+    index = lane_numbers(lanes)
     walk = _enter(media, k, start, total, index, generator(mi, lanes, pass_seed(*seeds)))
     state = (walk, index, visitor.begun(index))
     dr.while_loop(state, lambda walk, index, record: index < total, body, label="walks")
