@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from types import ModuleType
 
+import drjit as dr
 import numpy as np
 
 from halfspace_sss.arrays import Lanes, library
@@ -90,8 +91,6 @@ class MapTally(Tally):
         return replace(self, **{name: at_lanes(getattr(self, name), lanes) for name in names})
 
     def scatter(self, sums: tuple, event: Scatter) -> tuple:
-        import drjit as dr
-
         # contributions towards all observations, q_k = p(d . d_k) exp(-z / mu_k) / (eta² mu_k)
         q = []
         for ox, oy, mu, inverse_mu, scale in self.directions:
@@ -110,8 +109,6 @@ class MapTally(Tally):
 
     def _choose(self, q: list, target: Lanes) -> tuple[Lanes, tuple]:
         """The observation in whose share of the running sum the target lies."""
-        import drjit as dr
-
         UInt32, Float = self.types.UInt32, self.types.Float
         running, k = Float(0), UInt32(0)
         chosen = tuple(Float(self.directions[0][c]) for c in (0, 1, 3))
@@ -123,8 +120,6 @@ class MapTally(Tally):
         return k, chosen
 
     def _cell(self, x: Lanes, y: Lanes) -> tuple[Lanes, Lanes]:
-        import drjit as dr
-
         Int32, UInt32 = self.types.Int32, self.types.UInt32
         ratio = dr.sqrt(x * x + y * y) * self.inverse_scale
         u = dr.select(ratio > 15, ratio, dr.log(dr.maximum(dr.exp(dr.minimum(ratio, 16)) - 1, 1e-12)))
@@ -137,8 +132,6 @@ class MapTally(Tally):
 
 def _unit_tally(types: ModuleType, unit: MapUnit, mu_o: np.ndarray, delta_phi: np.ndarray) -> MapTally:
     """The tally of one medium and its observations."""
-    import drjit as dr
-
     m, grid = unit.medium, unit.grid
     g = m.g if m.g == 0 else dr.opaque(types.Float, m.g)
     mu = np.maximum(mu_internal(mu_o, m.eta), 1e-6)

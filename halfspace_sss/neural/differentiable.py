@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import numpy as np
 
 from halfspace_sss.arrays import Lanes, broadcast_query, is_torch, library
@@ -50,8 +51,6 @@ def neural_S(
 
 def _terms(hyper: Hypernetwork, c: list, like: Lanes) -> list:
     """Coefficients of `log_calibration`."""
-    import drjit as dr
-
     kind = type(like)
     h = _layered(hyper.calibration_layers, c, kind).array
     index = dr.uint32_array_t(kind)
@@ -59,8 +58,6 @@ def _terms(hyper: Hypernetwork, c: list, like: Lanes) -> list:
 
 
 def _layered(layers: Layers, c: list, kind: type) -> Lanes:
-    import drjit as dr
-
     h = dr.tensor_t(kind)(dr.concat([kind(v) for v in c]), (1, len(c)))
     for k, (W, b) in enumerate(layers):
         h = h @ _tensor(W, kind) + _tensor(b[None], kind)
@@ -70,13 +67,10 @@ def _layered(layers: Layers, c: list, kind: type) -> Lanes:
 
 
 def _tensor(array: np.ndarray, kind: type) -> Lanes:
-    import drjit as dr
-
     return dr.tensor_t(kind)(np.ascontiguousarray(array, np.float32))
 
 
 def _network(hyper: Hypernetwork, c: list, features: list) -> Lanes:
-    import drjit as dr
     from drjit import nn
 
     kind = type(sum(features[1:], features[0]))

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from types import ModuleType
 
+import drjit as dr
 import numpy as np
 
 from halfspace_sss.arrays import Lanes, aligned
@@ -56,8 +57,6 @@ class Ring:
     @staticmethod
     def seen(x: Lanes, y: Lanes, lengths: tuple, symmetric: bool) -> Lanes:
         """Share of the light at (x, y) that lies on the detector, lengths in the unit of x and y."""
-        import drjit as dr
-
         r2, (inner, outer) = x * x + y * y, lengths
         return dr.select((r2 >= inner * inner) & (r2 < outer * outer), type(x)(1), 0.0)
 
@@ -94,8 +93,6 @@ class Fibre:
     @staticmethod
     def seen(x: Lanes, y: Lanes, lengths: tuple, symmetric: bool) -> Lanes:
         """As `Ring.seen`; light of a beam along the normal counts by the share of its circle that the core covers."""
-        import drjit as dr
-
         at_x, at_y, d, radius = lengths
         if symmetric:
             r = dr.sqrt(x * x + y * y)
@@ -151,8 +148,6 @@ class PathTally(Tally):
         self.cells = CellSums(types, _places(edges2) * self.n)
 
     def boundary(self, sums: tuple, event: Boundary) -> tuple:
-        import drjit as dr
-
         if self.lengths is None:
             at = (dr.log(dr.maximum(event.length, SHORTEST)) - math.log(SHORTEST)) * (1 / LOG_STEP) + 1
             at = dr.select(event.length < SHORTEST, 0, dr.minimum(at, self.n - 1))
@@ -176,16 +171,12 @@ class DepthTally(Tally):
         self.cells = CellSums(types, _places(edges2) * self.n)
 
     def start(self, lanes: int) -> tuple:
-        import drjit as dr
-
         return tuple(dr.zeros(self.Float, lanes) for _ in range(3))
 
     def boundary(self, sums: tuple, event: Boundary) -> tuple:
         return sums[0] + event.weight * sums[2], sums[1] + event.weight, sums[2]
 
     def scatter(self, sums: tuple, event: Scatter) -> tuple:
-        import drjit as dr
-
         depth, inside = find_cell(self.depths, event.z)
         self.cells.add(event.weight, _place(self.edges2, event) * self.n + depth, event.lane, inside)
         return sums[0], sums[1], dr.select(event.order == 1, event.z, dr.maximum(sums[2], event.z))
@@ -195,8 +186,6 @@ class DetectorTally(Tally):
     """Flux on each detector within its aperture."""
 
     def __init__(self, types: ModuleType, detectors: Sequence[Ring | Fibre], medium: Medium, symmetric: bool) -> None:
-        import drjit as dr
-
         self.Float, self.detectors, self.symmetric = types.Float, detectors, symmetric
         scale = float(medium.sigma_t)
         self.lengths = [tuple(dr.opaque(types.Float, v * scale) for v in d.lengths()) for d in detectors]
@@ -204,13 +193,9 @@ class DetectorTally(Tally):
         self.least = [dr.opaque(types.Float, math.sqrt(1 - s * s)) for s in sines]  # cosine inside, by Snell
 
     def start(self, lanes: int) -> tuple:
-        import drjit as dr
-
         return tuple(dr.zeros(self.Float, lanes) for _ in self.detectors)
 
     def boundary(self, sums: tuple, event: Boundary) -> tuple:
-        import drjit as dr
-
         found = []
         for total, detector, lengths, least in zip(sums, self.detectors, self.lengths, self.least):
             value = event.weight * detector.seen(event.x, event.y, lengths, self.symmetric)
@@ -230,8 +215,6 @@ def _places(edges2: Lanes | None) -> int:
 
 def _place(edges2: Lanes | None, event: Boundary | Scatter) -> Lanes | int:
     """The ring of an event, or the number of rings if it lies in none."""
-    import drjit as dr
-
     if edges2 is None:
         return 0
     ring, inside = find_cell(edges2, event.x * event.x + event.y * event.y)

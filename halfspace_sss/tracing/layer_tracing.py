@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from types import ModuleType
 
+import drjit as dr
 import numpy as np
 
 from halfspace_sss.arrays import aligned
@@ -169,8 +170,6 @@ class _Tally:
 
     def event(self, event: Boundary, crosses, transmitted, deepest, layer, absorbed) -> None:
         """Add what leaves at an outer boundary (`event`), or what a scattering event in `layer` absorbs."""
-        import drjit as dr
-
         UInt32 = type(layer)
         leaving = dr.select(transmitted, UInt32(self.n), deepest) * 3 + dr.minimum(event.order, 2)
         cell = dr.select(crosses, leaving, layer + (3 * self.n + 3))
@@ -185,8 +184,6 @@ class _Constants:
     """Tables of the layers; they are gathered from, so that one kernel serves all stacks."""
 
     def __init__(self, types: ModuleType, layers: Layers) -> None:
-        import drjit as dr
-
         def table(values: list[float]):
             return aligned(types.Float, values)
 
@@ -202,8 +199,6 @@ class _Constants:
 
 def _walk(types, layers: Layers, mu_in, paths_per_lane: int, seed, tallies, *, diffuse: bool) -> tuple:
     """Trace walks one after another in each lane, as `walk.walk`; diffuse light begins with the weight T_12."""
-    import drjit as dr
-
     Float, UInt32 = types.Float, types.UInt32
     m, (tally,), lanes = _Constants(types, layers), tallies, dr.width(mu_in)
     mu_in = dr.clip(mu_in, 1e-6, 1.0)
@@ -229,8 +224,6 @@ def _walk(types, layers: Layers, mu_in, paths_per_lane: int, seed, tallies, *, d
 
 def _step(s: dict, m: _Constants, start: tuple, lane, tally: _Tally) -> dict:
     """One free path to a scattering event or an interface, roulette; ended walks begin anew."""
-    import drjit as dr
-
     rng, layer = s["rng"], s["layer"]
     Float, UInt32 = type(s["z"]), type(layer)
     x, y, z, dx, dy, dz = (s[k] for k in ("x", "y", "z", "dx", "dy", "dz"))

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import NamedTuple
 
+import drjit as dr
 import numpy as np
 
 from halfspace_sss.arrays import Lanes, aligned
@@ -28,8 +29,6 @@ BATCHES = 64  # independent groups of lanes, from whose spread the variance of a
 
 def _split(order: Lanes, value: Lanes) -> tuple[Lanes, Lanes]:
     """A value as (single, multiple) according to the scattering order."""
-    import drjit as dr
-
     return dr.select(order == 1, value, 0.0), dr.select(order > 1, value, 0.0)
 
 
@@ -40,8 +39,6 @@ class FluxTally(Tally):
         self.types = types
 
     def start(self, lanes: int) -> tuple:
-        import drjit as dr
-
         return (dr.zeros(self.types.Float, lanes), dr.zeros(self.types.Float, lanes))
 
     def boundary(self, sums: tuple, event: Boundary) -> tuple:
@@ -55,13 +52,9 @@ class MomentTally(Tally):
         self.types = types
 
     def start(self, lanes: int) -> tuple:
-        import drjit as dr
-
         return tuple(dr.zeros(self.types.Float, lanes) for _ in range(6))
 
     def boundary(self, sums: tuple, event: Boundary) -> tuple:
-        import drjit as dr
-
         leaves = event.weight > 0
         moments = (event.x * event.x + event.y * event.y, event.x, event.length)
         values = [dr.select(leaves, event.weight * m, 0.0) for m in moments]
@@ -76,8 +69,6 @@ class AngularTally(Tally):
     """
 
     def __init__(self, types: ModuleType, g: float, eta: float, mu_o: np.ndarray, delta_phi: np.ndarray) -> None:
-        import drjit as dr
-
         self.types = types
         self.g = g if g == 0 else dr.opaque(types.Float, g)
         self.mu = np.array([max(float(mu_internal(m, eta)), 1e-9) for m in mu_o])
@@ -88,13 +79,9 @@ class AngularTally(Tally):
         ]
 
     def start(self, lanes: int) -> tuple:
-        import drjit as dr
-
         return tuple(dr.zeros(self.types.Float, lanes) for _ in range(2 * len(self.mu)))
 
     def scatter(self, sums: tuple, event: Scatter) -> tuple:
-        import drjit as dr
-
         out = []
         for k, (ox, oy, mu, inverse_mu, scale) in enumerate(self.constants):
             cosine = event.dx * ox + event.dy * oy - event.dz * mu
@@ -108,8 +95,6 @@ class CellSums:
     """Fixed-point sums over cells, separately for each batch of lanes."""
 
     def __init__(self, types: ModuleType, cells: int, batches: int = BATCHES) -> None:
-        import drjit as dr
-
         self.cells, self.batches = cells, batches
         self.UInt64 = types.UInt64
         self.sums = dr.zeros(types.UInt64, cells * batches)
@@ -117,8 +102,6 @@ class CellSums:
 
     def add(self, value: Lanes, cell: Lanes, lane: Lanes, active: Lanes) -> None:
         """Add value >= 0 to a cell of the batch of this lane."""
-        import drjit as dr
-
         index = (lane % self.batches) * self.cells + cell
         dr.scatter_add(self.sums, self.UInt64(value * FIXED_POINT + 0.5), index, active)
 
@@ -154,8 +137,6 @@ class LineTally(Tally):
         self, types: ModuleType, angular: AngularTally, edges: np.ndarray, line_phi: float, half_width: float,
         symmetry: str,
     ) -> None:  # fmt: skip
-        import drjit as dr
-
         self.angular, self.symmetry = angular, symmetry
         line = abs(math.remainder(line_phi, 2 * math.pi)) if symmetry == "mirror" else line_phi
         self.line, self.half_width = (dr.opaque(types.Float, v) for v in (line, half_width))
@@ -166,8 +147,6 @@ class LineTally(Tally):
         self.areas = 0.5 * self.angle * np.diff(np.asarray(edges, dtype=np.float64) ** 2)
 
     def scatter(self, sums: tuple, event: Scatter) -> tuple:
-        import drjit as dr
-
         ox, oy, mu, inverse_mu, scale = self.angular.constants[0]
         # connect the event with the surface along the refracted w_o: t = z / mu_o'
         t = event.z * inverse_mu
@@ -189,8 +168,6 @@ class LineTally(Tally):
 
 def find_cell(edges: Lanes, value: Lanes) -> tuple[Lanes, Lanes]:
     """Index of the interval of an ascending Dr.Jit table that holds the value, and whether one does."""
-    import drjit as dr
-
     n = dr.width(edges)
     upper = dr.binary_search(0, n, lambda i: dr.gather(type(edges), edges, i) <= value)
     return dr.maximum(upper, 1) - 1, (upper > 0) & (upper < n)
@@ -339,8 +316,6 @@ def walk_passes(
         progress: called with (passes done, passes in all).
         trace: the walk in the medium, with the arguments of `walk`.
     """
-    import drjit as dr
-
     lanes, per_lane, passes = launch_shape(n_paths, dr.backend_v(types.Float) == dr.JitBackend.CUDA)
     for done in range(1, passes + 1):
         mu, recorded = _incidence(mu_i, lanes, np.random.default_rng([*seed, done])), tallies()

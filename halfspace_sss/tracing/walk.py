@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
 
+import drjit as dr
 import numpy as np
 
 from halfspace_sss.arrays import Lanes
@@ -101,8 +102,6 @@ class WalkConstants:
     @classmethod
     def uniform(cls, types: ModuleType, medium: Medium) -> WalkConstants:
         """One scalar medium for all lanes."""
-        import drjit as dr
-
         opaque = (dr.opaque(types.Float, v) for v in (medium.albedo, medium.g, 1 / medium.eta))
         return cls(*opaque, medium.g == 0, medium.eta == 1)
 
@@ -131,8 +130,6 @@ class WalkConstants:
 
     def check_lanes(self, lanes: int) -> None:
         """ValueError unless the constants are those of one medium or of as many lanes as are walked."""
-        import drjit as dr
-
         if dr.width(self.albedo) not in (1, lanes):
             raise ValueError(f"medium must have one value or {lanes} (one per lane), got {dr.width(self.albedo)}")
 
@@ -153,8 +150,6 @@ def generator(types: ModuleType, lanes: int, seed: tuple[int, int]) -> Lanes:
         types: a module of Dr.Jit array types, or Mitsuba.
         seed: from `pass_seed`.
     """
-    import drjit as dr
-
     UInt64 = types.UInt64
     lane = dr.arange(UInt64, lanes)
 
@@ -169,8 +164,6 @@ def generator(types: ModuleType, lanes: int, seed: tuple[int, int]) -> Lanes:
 
 def turn(dx: Lanes, dy: Lanes, dz: Lanes, cosine: Lanes, azimuth: Lanes) -> tuple[Lanes, Lanes, Lanes]:
     """Direction at the given polar cosine and azimuth about (dx, dy, dz); frame of Duff et al. 2017."""
-    import drjit as dr
-
     sin_a, cos_a = dr.sincos(azimuth)
     sine = dr.sqrt(dr.maximum((1 - cosine) * (1 + cosine), 0.0))
     sign = dr.select(dz < 0, type(dz)(-1), type(dz)(1))
@@ -186,8 +179,6 @@ def turn(dx: Lanes, dy: Lanes, dz: Lanes, cosine: Lanes, azimuth: Lanes) -> tupl
 
 def at_lanes(value: Any, lanes: Lanes) -> Any:
     """Arrays, or trees of them, at some of the lanes, scheduled to be evaluated; numbers stay."""
-    import drjit as dr
-
     if isinstance(value, dict):
         return {key: at_lanes(v, lanes) for key, v in value.items()}
     if isinstance(value, (tuple, list)):
@@ -202,8 +193,6 @@ def at_lanes(value: Any, lanes: Lanes) -> Any:
 
 def _put_back(whole: Any, part: Any, lanes: Lanes) -> None:
     """Write what `at_lanes` took to where it was."""
-    import drjit as dr
-
     if isinstance(part, (tuple, dict)):
         for key in part if isinstance(part, dict) else range(len(part)):
             _put_back(whole[key], part[key], lanes)
@@ -226,8 +215,6 @@ def in_launches(
         body: of `given` and the state, the next state.
         label: of the kernel.
     """
-    import drjit as dr
-
     UInt32 = dr.uint32_array_t(type(going(*state)))
 
     def launch(state: tuple, given: tuple, most: Lanes) -> tuple:
@@ -295,8 +282,6 @@ def walk(
     Raises:
         ValueError: the constants are of another number of lanes.
     """
-    import drjit as dr
-
     Float, UInt32 = types.Float, types.UInt32
     lanes = dr.width(mu_in)
     constants = medium if isinstance(medium, WalkConstants) else WalkConstants.uniform(types, medium)
@@ -327,8 +312,6 @@ def walk(
 
 def roulette(weight: Lanes, order: Lanes) -> tuple[Lanes, Lanes]:
     """Probability that a walk goes on, and its weight if it does."""
-    import drjit as dr
-
     Float = type(weight)
     low = weight < ROULETTE_WEIGHT
     survivor = ROULETTE_WEIGHT * ROULETTE_BOOST
@@ -342,8 +325,6 @@ def roulette(weight: Lanes, order: Lanes) -> tuple[Lanes, Lanes]:
 
 def _entry(rng: Lanes, spread: tuple) -> tuple:
     """Where a walk begins, by Box and Muller; the origin draws no numbers."""
-    import drjit as dr
-
     if not spread:
         return 0.0, 0.0
     r = dr.sqrt(-2 * dr.log(1 - rng.next_float32()))
@@ -353,8 +334,6 @@ def _entry(rng: Lanes, spread: tuple) -> tuple:
 
 def _step(s: dict, sums: tuple, m: WalkConstants, start: tuple, lane: Lanes, tallies: Sequence[Tally]) -> tuple:
     """One free path, the boundary if it is met, one scattering event, roulette; ended walks begin anew."""
-    import drjit as dr
-
     rng = s["rng"]
     Float, UInt32 = type(s["z"]), type(s["order"])
     x, y, z, dx, dy, dz = (s[k] for k in ("x", "y", "z", "dx", "dy", "dz"))
