@@ -18,9 +18,7 @@ MOMENTS = ("exact", "published")
 @dataclass(frozen=True)
 class DiffuseBoundary:
     """Constants of the surface: weights of fluence and irradiance, A of the extrapolation distance, exit normaliser.
-
-    A = (1 - C_E) / (2 C_phi), z_b = 2 A D, N = 4 C_phi(1/eta). Source: d'Eon and Irving 2011.
-    """
+    A = (1 - C_E) / (2 C_phi), z_b = 2 A D, N = 4 C_phi(1/eta). Source: d'Eon and Irving 2011."""
 
     C_phi: float
     C_E: float
@@ -33,9 +31,7 @@ class DiffuseBoundary:
     @staticmethod
     def for_index(eta: float, moments: str = "exact") -> DiffuseBoundary:
         """The boundary of a relative index.
-
-        moments: by quadrature ("exact"), or by the polynomials printed in papers ("published", eta <= 2.5).
-        """
+        moments: by quadrature ("exact"), or by the polynomials printed in papers ("published", eta <= 2.5)."""
         check_choice("moments", moments, MOMENTS)
         if moments == "exact":
             return DiffuseBoundary(fresnel.C_phi(eta), fresnel.C_E(eta), 4 * fresnel.C_phi(1 / eta))
@@ -52,9 +48,7 @@ def unit_gauss(n: int) -> tuple[np.ndarray, np.ndarray]:
 
 class Grosjean:
     """Constants of modified diffusion in mean free paths: D = (2 sigma_a + sigma_s') / (3 sigma_t'²), z_b = 2 A D.
-
-    Source: Grosjean 1956 as used by d'Eon and Irving 2011.
-    """
+    Source: Grosjean 1956 as used by d'Eon and Irving 2011."""
 
     def __init__(self, medium: Medium, boundary: DiffuseBoundary) -> None:
         m = medium.in_mfp()
@@ -67,10 +61,8 @@ class Grosjean:
 
 def safe_differences(lib: Library, a: Real, d_r: Real, d_v: Real, delta: Real) -> tuple[Real, Real, Real]:
     """Differences between a real and a virtual source at distances d_r and d_v = d_r + delta, over exp(-a d_r).
-
-    Returns exp(-a delta), 1/d_r - exp(-a delta)/d_v and the same of (1 + a d) exp(-a d)/d³; each is a sum of terms
-    of one sign, whatever the size of delta, given from the difference of the squares.
-    """
+    Returns exp(-a delta), 1/d_r - exp(-a delta)/d_v and the same of (1 + a d) exp(-a d)/d³; each is a sum of terms of
+    one sign, whatever the size of delta, given from the difference of the squares."""
     x = lib.expm1(-a * delta)
     inverse_r, inverse_v = 1 / d_r, 1 / d_v
     fluence = inverse_v * (delta * inverse_r - x)

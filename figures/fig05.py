@@ -163,12 +163,8 @@ STEP = 1.25  # of the time from one image that is kept to the next
 
 class Snapshots:
     """Images at times that grow by a factor; the clock stands still while one is kept.
-
-    Attributes:
-        times: seconds since the start.
-        images: linear radiance (H, W, 3) at those times.
-        spp: samples per pixel in them.
-    """
+    `times`: seconds since the start. `images`: linear radiance (H, W, 3) at those times. `spp`: samples per pixel in
+    them."""
 
     def __init__(self) -> None:
         self.times: list[float] = []

@@ -31,9 +31,7 @@ Real: TypeAlias = "float | np.ndarray | torch.Tensor | drjit.ArrayBase"  # a num
 
 def _fold(f: Callable[..., tuple], tables: tuple, state: tuple, x: Real) -> tuple:
     """state = f(*state, *row) for each row of the equally long 1-D `tables`, in order; x tells the array type.
-
-    A loop of array operations, one symbolic loop for Dr.Jit: kernels stay small however many rows there are.
-    """
+    A loop of array operations, one symbolic loop for Dr.Jit: kernels stay small however many rows there are."""
     for row in zip(*(table.tolist() for table in tables)):
         state = f(*state, *row)
     return state
@@ -205,11 +203,8 @@ def is_torch(lib: Library) -> bool:
 
 def library(*args: Real) -> Library:
     """The functions for the arguments: Dr.Jit if any is a Dr.Jit array, then torch, else NumPy.
-
-    Raises:
-        ValueError: torch and Dr.Jit arrays are mixed.
-        BackendError: the LLVM that Dr.Jit found would abort the process.
-    """
+    ValueError if torch and Dr.Jit arrays are mixed. BackendError if the LLVM that Dr.Jit found would abort the
+    process."""
     parts = [type(a).__module__.split(".") for a in args]
     modules = {part[0] for part in parts}
     if "torch" in modules and "drjit" in modules:
@@ -288,10 +283,8 @@ def broadcast_query(*args: Real, names: Sequence[str] = ()) -> tuple[Library, tu
 
 def aligned(kind: type, values: np.ndarray) -> Lanes:
     """Numbers of any shape as one array of Dr.Jit, 32 bits each, at an address that is a multiple of 64.
-
     Dr.Jit takes over the memory of NumPy, and whether its address is one is in the code of kernels: where chance
-    decides, they are compiled twice for each such array.
-    """
+    decides, they are compiled twice for each such array."""
     import drjit as dr
 
     dtype = {dr.VarType.UInt32: np.uint32, dr.VarType.Int32: np.int32}.get(dr.type_v(kind), np.float32)

@@ -50,10 +50,8 @@ def _candidates() -> list[str]:
 
 def prefer_bundled_llvm() -> None:
     """Point Dr.Jit at the LLVM that pip installed, unless the user set one; called when the package is imported.
-
     Dr.Jit loads LLVM while it is imported itself and keeps it: what is set later has no effect. One that would abort
-    the process is warned of then, as scenes may be loaded before this package is asked for anything.
-    """
+    the process is warned of then, as scenes may be loaded before this package is asked for anything."""
     if "drjit" in sys.modules:
         import drjit as dr
 
@@ -91,11 +89,8 @@ def _told_of_loaded(version: tuple[int, int, int] | None) -> str:
 @once
 def prepare_llvm() -> None:
     """See to it that Dr.Jit uses an LLVM that works; a path that the user set is kept.
-
-    Raises:
-        BackendError: none is found, the one the user set is too old or cannot be loaded, or Dr.Jit was imported
-            before with an old one, which would abort the process.
-    """
+    BackendError if none is found, the one the user set is too old or cannot be loaded, or Dr.Jit was imported before
+    with an old one, which would abort the process."""
     if "drjit" in sys.modules:
         _refuse_old_loaded_llvm()
         return
@@ -153,9 +148,7 @@ def limit_threads(threads: int) -> None:
 
 def one_blas_thread() -> AbstractContextManager:
     """One thread of the BLAS: its sums then have one order, and small matrices are slower with more.
-
-    On a machine that has other work they are so many times over.
-    """
+    On a machine that has other work they are so many times over."""
     return _controller().limit(limits=1, user_api="blas")
 
 
@@ -183,11 +176,7 @@ def clock() -> float:
 @once
 def array_types(backend: str = "llvm") -> ModuleType:
     """The module of Dr.Jit array types of a backend (`drjit.llvm` or `drjit.cuda`), ready to compute.
-
-    Raises:
-        ValueError: the name is not a backend.
-        BackendError: the backend cannot run on this machine.
-    """
+    ValueError if the name is not a backend. BackendError if the backend cannot run on this machine."""
     if backend not in BACKENDS:
         raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
     if backend == "llvm":

@@ -19,10 +19,7 @@ def _plain(value: object) -> object:
 
 def did_you_mean(value: object, known: Iterable[str], most: int = 1) -> str:
     """The end of a message about an unknown name: the nearest known ones, or nothing if none is near.
-
-    Args:
-        known: names, or a mapping from what is compared to the name that is shown.
-    """
+    `known`: names, or a mapping from what is compared to the name that is shown."""
     shown = dict(known) if isinstance(known, Mapping) else {name: name for name in known}
     close = difflib.get_close_matches(str(value), shown, n=most)
     return f"; did you mean {', '.join(repr(shown[key]) for key in close)}?" if close else ""
@@ -93,11 +90,8 @@ def check_cosine(name: str, value: object, low: float = 0.0) -> float:
 
 def check_query(lib: object, args: tuple, given: tuple) -> tuple:
     """Arguments of a query in their ranges, cosines that exceed 1 by rounding as 1; also refuses NaN.
-
-    Args:
-        args: the arguments in one library and precision.
-        given: the same as they came, whose precision says what is rounding.
-    """
+    `args`: the arguments in one library and precision. `given`: the same as they came, whose precision says what is
+    rounding."""
     if type(args[0]).__module__.startswith(("drjit", "mitsuba")):
         return args
     bounds = {"r": (0.0, math.inf), "mu_i": (0.0, 1.0), "phi_i": None, "mu_o": (0.0, 1.0), "phi_o": None}

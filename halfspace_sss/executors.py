@@ -166,9 +166,7 @@ def scheduler(address: str, say: Callable[[str], object] | None = None) -> Itera
 
 def _set_up(worker: Worker, version: str) -> None:
     """Refuse workers that would give other numbers or hang, and give the others the threads of OMP_NUM_THREADS.
-
-    Dask gives each worker OMP_NUM_THREADS = 1 unless its configuration says another number.
-    """
+    Dask gives each worker OMP_NUM_THREADS = 1 unless its configuration says another number."""
     if halfspace_sss.__version__ != version:
         raise ValueError(f"worker {worker.name} must have halfspace-sss {version}, got {halfspace_sss.__version__}")
     if worker.state.nthreads != 1:

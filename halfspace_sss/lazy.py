@@ -13,11 +13,8 @@ def lazy_names(
     package: str, modules: Mapping[str, Iterable[str]]
 ) -> tuple[Callable[[str], object], Callable[[], list[str]]]:
     """`__getattr__` and `__dir__` of a package.
-
-    Args:
-        package: its `__name__`.
-        modules: public names by module within the package; "" for names that are themselves modules of the package.
-    """
+    `package`: its `__name__`. `modules`: public names by module within the package; "" for names that are themselves
+    modules of the package."""
     homes = {name: home for home, names in modules.items() for name in names}
 
     def get(name: str) -> object:
@@ -35,9 +32,7 @@ def lazy_names(
 
 def once(f: Callable) -> Callable:
     """`functools.cache` under a lock: threads that ask while f runs wait for its result and do not run it again.
-
-    Mitsuba makes the objects of a scene in parallel, and each asks for materials and models.
-    """
+    Mitsuba makes the objects of a scene in parallel, and each asks for materials and models."""
     cached, lock = functools.cache(f), threading.RLock()
 
     @functools.wraps(f)

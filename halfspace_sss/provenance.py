@@ -62,11 +62,8 @@ def provenance(**parameters: object) -> JsonDict:
 
 def path_of(path: str | os.PathLike) -> Path:
     """A path of this machine, or that of an object store for a URL that fsspec knows, such as s3://BUCKET/maps.
-
-    Raises:
-        ValueError: universal_pathlib is not installed, or no file system has the protocol. The package of the file
-            system, such as s3fs, is missed when the path is used.
-    """
+    ValueError if universal_pathlib is not installed, or no file system has the protocol. The package of the file
+    system, such as s3fs, is missed when the path is used."""
     if is_remote(path):
         return path
     if "://" not in str(path):
@@ -166,11 +163,7 @@ def write_together(files: Mapping[Path, bytes | str]) -> None:
 
 def replace_together(moves: Mapping[Path, Path], gone: Iterable[Path] = ()) -> None:
     """Rename files, old name to new, so that those with the new names are at any moment of one set.
-
-    Args:
-        moves: old path -> new path.
-        gone: files of the set before that the new one does not have; they are removed.
-    """
+    `moves`: old path -> new path. `gone`: files of the set before that the new one does not have; they are removed."""
     others = [*list(moves.values())[1:], *gone]
     aside = {path: path.with_name(f".{path.name}.before") for path in others if path.exists()}
     placed = False
@@ -202,11 +195,8 @@ def naming(path: Path) -> Iterator[None]:
 
 class KeptRows(dict):
     """Rows of a long table by name, as JSON values, in a file: the same run started again goes on after them.
-
-    Args:
-        path: file of the rows, a line for each, after a line of what they depend on.
-        of: what the rows depend on besides versions and commit; rows of something else are dropped.
-    """
+    `path`: file of the rows, a line for each, after a line of what they depend on. `of`: what the rows depend on
+    besides versions and commit; rows of something else are dropped."""
 
     def __init__(self, path: Path, of: Mapping[str, object]) -> None:
         told = provenance()

@@ -42,14 +42,8 @@ def contender(
     scan: str = "bunny",
 ) -> mi.Scene | tuple[mi.Scene, ...]:  # fmt: skip
     """The scene of a scanned object for a method, see `ready`.
-
-    Args:
-        method, bare: as in `ready`.
-        material, size, lights, sampler, scan: as in `figures.computing.scans.scan_scene`.
-
-    Raises:
-        ValueError: no such method, material or lights.
-    """
+    `method`, `bare`: as in `ready`. `material`, `size`, `lights`, `sampler`, `scan`: as in
+    `figures.computing.scans.scan_scene`. ValueError if there is no such method, material or lights."""
     from halfspace_sss import materials
 
     description = scan_scene(material, size, lights, scan, sampler)
@@ -102,9 +96,7 @@ def _volume_scene(description: SceneDict, name: str, medium: Medium, rr_depth: i
 
 def long_walk(task: Task) -> dict[str, object]:
     """A long image by our walk, in passes that survive an interruption: what the other images are compared with.
-
-    The parameters of the task are material, size, lights, spp, seed and, unless it is the bunny, scan.
-    """
+    The parameters of the task are material, size, lights, spp, seed and, unless it is the bunny, scan."""
     prepare()
     p = task.params
     return long_passes(task, contender(WALK, p["material"], p["size"], p["lights"], scan=p.get("scan", "bunny")))
@@ -168,10 +160,7 @@ def _apart(image: np.ndarray, first: np.ndarray, second: np.ndarray, mask: np.nd
 
 def reference_shot(result: Result, label: str = "Path traced") -> tuple[Shot, np.ndarray, float]:
     """The reference exposed as it is shown, the mask of the pixels that count, and the stops.
-
-    Args:
-        result: of a part that gave `reference_image`.
-    """
+    `result`: of a part that gave `reference_image`."""
     image, mask = result.images["image"], result.images["cover"] > 0.5
     stops = stops_of(image, mask)
     apart = f"{result.numbers['halves']:.3f}"  # text: it is no model that could be the best

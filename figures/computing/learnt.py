@@ -26,11 +26,7 @@ SHAPES, CANDLE_RESOLUTION = ("bunny", "candle"), 96
 
 def shape_of(name: str, folder: Path) -> tuple[mi.Shape, Medium, float]:
     """A Mitsuba shape, its medium and millimetres of a unit: the bunny of potato, or the candle of wax.
-
-    Args:
-        name: "bunny" or "candle".
-        folder: where the mesh of the candle is written.
-    """
+    `name`: "bunny" or "candle". `folder`: where the mesh of the candle is written."""
     import mitsuba as mi
 
     if name == "bunny":
@@ -51,11 +47,7 @@ def training_of(name: str) -> str:
 @contextmanager
 def with_weights(folder: Path, needed: Mapping[str, Result]) -> Iterator[None]:
     """Renders find what was learnt in the parts of training among the needed ones, and no other weights.
-
-    Args:
-        folder: of the task, where the files are put.
-        needed: results that the task was given.
-    """
+    `folder`: of the task, where the files are put. `needed`: results that the task was given."""
     place = check_folder(folder) / "weights"
     place.mkdir(parents=True, exist_ok=True)
     for name, result in needed.items():
@@ -84,23 +76,14 @@ def train_scan(name: str, material: str, chunks: int, scan: str = "bunny") -> Pa
 
 def train_modelled(name: str, resolution: int, chunks: int) -> Part:
     """The part in which a modelled object is learnt.
-
-    Args:
-        name: a name in `modelling.objects.OBJECTS`.
-        resolution: of its surface.
-        chunks: as in `train_scan`.
-    """
+    `name`: a name in `modelling.objects.OBJECTS`. `resolution`: of its surface. `chunks`: as in `train_scan`."""
     params = {"object": name, "resolution": resolution, "chunks": chunks, "seed": 0, "model": FULL_GEOMETRY}
     return Part(training_of(name), _modelled, params, chunks)
 
 
 def object_parts(name: str, resolution: int, folder: Path, seed: int = 0) -> SceneDict:
     """A modelled object with a smooth boundary, and what belongs to it, for a scene in mm.
-
-    Args:
-        name, resolution: as in `train_modelled`.
-        seed: of everything uneven about it.
-    """
+    `name`, `resolution`: as in `train_modelled`. `seed`: of everything uneven about it."""
     if name == "candle":
         return candle_parts(folder, resolution, seed)
     result = make_varying(name, resolution, max(round(GRID * resolution), 8), seed)
@@ -123,9 +106,7 @@ def _modelled(task: Task) -> dict[str, object]:
 
 def trained(task: Task, scene: SceneDict, name: str) -> dict[str, object]:
     """Weights of the object called `name` in the description of a scene, with what they took.
-
-    The parameters "chunks" and "seed" of the task are those of the training.
-    """
+    The parameters "chunks" and "seed" of the task are those of the training."""
     from full_geometry.learning.training import train_unattended
     from full_geometry.objects.objects import object_of
     from full_geometry.scenes.scene_files import open_scene
@@ -157,10 +138,7 @@ def accepting(medium: Medium) -> list[str]:
 
 def weight_files(model: str, medium: Medium) -> tuple[Path, ...]:
     """The files of weights that a model reads for a medium, for `Part.inputs`; none for an analytic model.
-
-    Raises:
-        ValueError: the model is not trained for the medium.
-    """
+    ValueError if the model is not trained for the medium."""
     from halfspace_sss.neural import material_model, paper_model
     from halfspace_sss.neural.universal import shipped_weights
 

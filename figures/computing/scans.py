@@ -39,9 +39,7 @@ _EYE, _LAMP = (6.55, 4.3, 24), (-13.45, 9.3, -9)  # from what is looked at, unit
 
 def prepare() -> None:
     """Set the variant of Mitsuba that the figures use unless it is one of `VARIANTS`, and register the plugins.
-
-    Scenes of earlier parts are freed, so that the objects of the next get their numbers, and it their kernels.
-    """
+    Scenes of earlier parts are freed, so that the objects of the next get their numbers, and it their kernels."""
     import mitsuba as mi
 
     import full_geometry
@@ -131,17 +129,9 @@ def environment_file(name: str) -> Path:
 
 
 def environment(name: str, scale: float = 1.0, turn: float = 0.0) -> SceneDict:
-    """An environment map as an emitter for `mitsuba.load_dict`.
-
-    Args:
-        name: "studio" (two lamps in a dark hall), "sunset" (a square by the sea, the sun just below the horizon) or
-            "forest" (a clearing by day).
-        scale: of its radiance.
-        turn: about y, degrees.
-
-    Raises:
-        ValueError: there is none of that name.
-    """
+    """An environment map as an emitter for `mitsuba.load_dict`. `name`: "studio" (two lamps in a dark hall), "sunset"
+    (a square by the sea, the sun just below the horizon) or "forest" (a clearing by day). `scale`: of its radiance.
+    `turn`: about y, degrees. ValueError if there is none of that name."""
     import mitsuba as mi
 
     image = np.maximum(read_exr(environment_file(name))[..., :3], 0)  # the file has negative pixels
@@ -154,12 +144,8 @@ SEEDS_APART = 10_000  # of the halves of an image; passes count up from the firs
 
 def long_render(task: Task, scene: mi.Scene, spp_per_pass: int, passes: int, half: int = 0) -> dict[str, object]:
     """The image of a scene with its variance, seconds and samples; what is done of it is kept in the task's folder.
-
-    Args:
-        task: whose parameter "seed" is that of the first pass.
-        spp_per_pass, passes: samples per pixel of each pass, and their number.
-        half: 1 for another image of other random numbers.
-    """
+    `task`: whose parameter "seed" is that of the first pass. `spp_per_pass`, `passes`: samples per pixel of each pass,
+    and their number. `half`: 1 for another image of other random numbers."""
     from full_geometry.scenes import reference
 
     result = reference.render(

@@ -64,9 +64,7 @@ def gathered_anew(scene: mi.Scene) -> float:
 
 def rendered(scene: mi.Scene, spp: int, *seed: int) -> tuple[np.ndarray, float]:
     """An image (H, W, 3) and the seconds it took; ValueError if it is not finite.
-
-    Of a tuple of scenes the first gives the first channel, and so on; their times add up.
-    """
+    Of a tuple of scenes the first gives the first channel, and so on; their times add up."""
     import mitsuba as mi
 
     number = int(np.random.SeedSequence(seed).generate_state(1)[0])
@@ -84,14 +82,8 @@ def rendered(scene: mi.Scene, spp: int, *seed: int) -> tuple[np.ndarray, float]:
 
 def pass_size(scene: mi.Scene, seconds: float, seed: int = 0) -> int:
     """Samples per pixel of a pass that takes so many seconds or half as many; its kernels are compiled then.
-
-    Args:
-        seconds: aimed at; one sample per pixel may take longer.
-        seed: of what is rendered for it.
-
-    Raises:
-        ValueError: seconds is not above 0.
-    """
+    `seconds`: aimed at; one sample per pixel may take longer. `seed`: of what is rendered for it. ValueError if seconds
+    is not above 0."""
     check_interval("seconds", seconds, 1e-6, 1e6)
     pixels = int(np.prod(np.array(scene.sensors()[0].film().crop_size())))
     most, spp, results = max(1, MOST_LANES // pixels), 1, []

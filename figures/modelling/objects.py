@@ -57,14 +57,8 @@ class Candle:
 
 def make_candle(resolution: int = 160, seed: int = 0) -> Candle:
     """The candle.
-
-    Args:
-        resolution: grid cubes along its height, >= 8; that of wick and flame is fixed.
-        seed: of the drips and the unevenness of rim and side.
-
-    Raises:
-        ValueError: the resolution is too small.
-    """
+    `resolution`: grid cubes along its height, >= 8; that of wick and flame is fixed. `seed`: of the drips and the
+    unevenness of rim and side. ValueError if the resolution is too small."""
     drips = _drips(seed)
     wax = surface(lambda p: wax_distance(p, seed, drips), BOX, resolution)
     box = Box((-1.5, POOL - 1.0, -1.5), (2.5, POOL + 8.0, 2.0))
@@ -152,16 +146,9 @@ def tissue(name: str) -> Material:
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """A medium on the cells of a box; g = 0.
-
-    Args:
-        sigma_t: (nz, ny, nx), 1/mm, > 0: extinction, the same in all channels.
-        albedo: (nz, ny, nx, 3), in [0, 1].
-        box: that the cells fill, mm; values belong to their middles.
-
-    Raises:
-        ValueError: the shapes do not match or a value is out of range.
-    """
+    """A medium on the cells of a box; g = 0. `sigma_t`: (nz, ny, nx), 1/mm, > 0: extinction, the same in all channels.
+    `albedo`: (nz, ny, nx, 3), in [0, 1]. `box`: that the cells fill, mm; values belong to their middles. ValueError if
+    the shapes do not match or a value is out of range."""
 
     sigma_t: np.ndarray
     albedo: np.ndarray
@@ -273,11 +260,7 @@ def make_varying(name: str, resolution: int = 192, grid_resolution: int = 160, s
 
 def candle_parts(folder: Path, resolution: int = 192, seed: int = 0) -> SceneDict:
     """The candle: "candle" with the surface `translucent`, "wick", and "flame", an area light in the bowl; mm.
-
-    Args:
-        folder: where its PLY files are written.
-        resolution, seed: as for `make_candle`.
-    """
+    `folder`: where its PLY files are written. `resolution`, `seed`: as for `make_candle`."""
     made, wax = make_candle(resolution, seed), tissue("candle wax").medium
     files = {name: getattr(made, name).write_ply(Path(folder) / f"{name}.ply") for name in ("wax", "wick", "flame")}
     surface = {
@@ -300,10 +283,7 @@ def candle_parts(folder: Path, resolution: int = 192, seed: int = 0) -> SceneDic
 
 def learnable_parts(result: Varying, folder: Path) -> SceneDict:
     """An object whose medium varies with the surface `translucent` and a smooth boundary, so that it can be learnt; mm.
-
-    Args:
-        folder: where its PLY file and its grid volumes are written.
-    """
+    `folder`: where its PLY file and its grid volumes are written."""
     path = result.mesh.write_ply(Path(folder) / f"{result.name}.ply")
     grids = result.grid.write(Path(folder), result.name)
     surface = {"type": "translucent", "model": "neural", "g": 0.0, "eta": result.eta, **grids}

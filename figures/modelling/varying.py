@@ -42,10 +42,8 @@ LAID = (((-13.0, 42.0), -0.5, 1), ((14.0, 43.0), 2.2, -1))  # of each: x and z o
 @dataclass(frozen=True)
 class Mandarin:
     """The distances and the tissues of a peeled mandarin, about 56 mm wide and 40 mm tall, with a given seed.
-
     Two of its segments are taken out and laid beside it. Each segment is flesh of juice sacs in a thin membrane, with
-    white strands outside and a pip or two at its inner edge.
-    """
+    white strands outside and a pip or two at its inner edge."""
 
     seed: int = 0
 
@@ -205,9 +203,7 @@ CRUST = 1.5  # thickness, mm
 @dataclass(frozen=True)
 class Croissant:
     """The distances and the tissues of a croissant with a given seed, about 102 mm across, 79 mm deep and 37 mm tall.
-
-    One tip is cut off: layered crust, crumb with pores.
-    """
+    One tip is cut off: layered crust, crumb with pores."""
 
     seed: int = 0
 
@@ -321,9 +317,7 @@ FIBRE = 0.25  # slant of the fibres against the vertical, radians
 @dataclass(frozen=True)
 class Meat:
     """The distances and the tissues of a steak of marbled beef with a given seed, with a rim of fat along one side.
-
-    It is about 87 mm long, 64 mm wide and 21 mm thick.
-    """
+    It is about 87 mm long, 64 mm wide and 21 mm thick."""
 
     seed: int = 0
 

@@ -38,11 +38,7 @@ from full_geometry.geometry.shape import (
 @dataclass(frozen=True, eq=False)
 class Group:
     """A group that instances show.
-
-    Args:
-        instances: of it, at least one.
-        to_world: array (n, 4, 4), of each instance.
-    """
+    `instances`: of it, at least one. `to_world`: array (n, 4, 4), of each instance."""
 
     shapes: list[mi.Shape]
     instances: list[mi.Shape]
@@ -94,12 +90,8 @@ def shapes_of(scene: mi.Scene, groups: Sequence[Group]) -> list[mi.Shape]:
 @dataclass(frozen=True, eq=False)
 class InstanceTable:
     """Numbers of shapes and of their instances in a scene, for look-ups in tables of kernels.
-
-    Args:
-        shapes: each once.
-        groups: of each, or None for what stands in the scene itself.
-        first: array (shapes + 1,), the number of the first thing of each shape, then that of all things.
-    """
+    `shapes`: each once. `groups`: of each, or None for what stands in the scene itself. `first`: array (shapes + 1,),
+    the number of the first thing of each shape, then that of all things."""
 
     shapes: list[mi.Shape]
     groups: list[Group | None]
@@ -399,10 +391,7 @@ def _interaction(
 @dataclass(frozen=True, eq=False)
 class InstanceProposals:
     """`Proposals` of a shape in a group: positions are drawn in the frame of the group, directions in the scene.
-
-    Args:
-        proposals: `points.Proposals` of the shape.
-    """
+    `proposals`: `points.Proposals` of the shape."""
 
     proposals: Proposals
     transform: InstanceTransform

@@ -95,20 +95,13 @@ def evaluate(*values: Any) -> None:
 
 def surface_point(p: mi.Point3f, n: mi.Normal3f, n_out: mi.Normal3f, w: mi.Vector3f) -> SurfacePoint:
     """A point of the surface with the shading normal that w sees.
-
-    Args:
-        p: position.
-        n, n_out: outward geometric and shading normal.
-        w: direction outside.
-    """
+    `p`: position. `n`, `n_out`: outward geometric and shading normal. `w`: direction outside."""
     return SurfacePoint(mi.Point3f(p), mi.Normal3f(n), lifted(n_out, n, w), mi.Vector3f(w))
 
 
 def refract_in(at: SurfacePoint, eta: mi.Float | float) -> tuple[mi.Vector3f, mi.Float, mi.Bool]:
     """Direction inside of light that is seen along w, Fresnel transmittance, and whether it goes inwards at all.
-
-    mu' = sqrt(1 - (1 - mu²)/eta²), d = -w/eta + n (mu/eta - mu').
-    """
+    mu' = sqrt(1 - (1 - mu²)/eta²), d = -w/eta + n (mu/eta - mu')."""
     mu = dr.dot(at.w, at.n_out)
     inner = 1 - (1 - mu * mu) / (eta * eta)
     d = at.n_out * (mu / eta - dr.safe_sqrt(inner)) - at.w / eta
@@ -164,9 +157,7 @@ def channel_mean(value: mi.Spectrum) -> mi.Float:
 
 def place(p: mi.Point3f, n: mi.Normal3f, medium: MediumAt | tuple[()] = ()) -> mi.Interaction3f:
     """A point with its geometric normal.
-
-    Under spectral variants with the wavelengths of a `medium`: emitters are asked for those.
-    """
+    Under spectral variants with the wavelengths of a `medium`: emitters are asked for those."""
     result = dr.zeros(mi.Interaction3f)
     result.p, result.n = mi.Point3f(p), mi.Normal3f(n)
     if mi.is_spectral and medium:
@@ -201,10 +192,8 @@ def separation(p_i: mi.Point3f, n_i: mi.Normal3f, p_o: mi.Point3f, n_o: mi.Norma
 
 def plane_query(at: SurfacePoint, out: SurfacePoint, geometry: str) -> tuple[mi.Float, ...]:
     """(r, mu_i, phi_i, mu_o, phi_o) of the half-space for light that enters at `at` and leaves at `out`.
-
     r as in `separation`; each direction is taken against the normal of its own point, its azimuth from x_i -> x_o
-    projected there. Cosines below the horizon come out as 0, at which every model is 0.
-    """
+    projected there. Cosines below the horizon come out as 0, at which every model is 0."""
     d = out.p - at.p
     frame_i, frame_o = local_frame(at.n_out, d), local_frame(out.n_out, d)
     mu_i, mu_o = (dr.clip(dr.dot(point.w, point.n_out), 0, 1) for point in (at, out))
@@ -337,9 +326,7 @@ class Proposals(Protocol):
 
     def sample_direction(self, entry: EntrySample, out: SurfacePoint, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
         """A direction w_i that points away from the surface at the entry, for a pair of uniforms, and its density.
-
-        The density is over solid angle, 1/sr.
-        """
+        The density is over solid angle, 1/sr."""
 
     def pdf_direction(self, entry: EntrySample, out: SurfacePoint, w_i: mi.Vector3f) -> mi.Float:
         """The density of `sample_direction`, 1/sr; 0 below the surface."""
@@ -357,10 +344,7 @@ class CosineProposals(Proposals, Protocol):
 
 class ObjectAlbedo(Protocol):
     """The directional albedo of an object under uniform illumination, alpha = ∫ S mu_i dw_i dA_i.
-
-    Attributes:
-        known: two spectra, 1 in the channels where it may stand for uniform light: of orders below two, and of S.
-    """
+    `known`: two spectra, 1 in the channels where it may stand for uniform light: of orders below two, and of S."""
 
     known: tuple[mi.Spectrum, mi.Spectrum]
 
@@ -389,11 +373,7 @@ class Transport(Protocol):
 
     def S(self, exit: Any, at: SurfacePoint, active: mi.Bool = True) -> mi.Spectrum:
         """S(x_i, w_i; x_o, w_o) per channel, 1/((scene unit)² sr); 0 below the horizons.
-
-        Args:
-            exit: from `prepare`.
-            at: entry, with w_i.
-        """
+        `exit`: from `prepare`. `at`: entry, with w_i."""
 
     def paint(self, at: SurfacePoint) -> mi.Spectrum:
         """The reflectance of the half-space of the medium at an exit; only of objects with textures."""
@@ -439,14 +419,9 @@ LATTICE = 0.7548776662466927, 0.5698402909980532  # of two dimensions (Roberts 2
 
 @dataclass(frozen=True, eq=False)
 class PositionSampler:
-    """Points of entry of one object.
-
-    Args:
-        table: radial density about the exit.
-        points: uniform points of the object.
-        area_share: share s of the candidates that are uniform over the area: s/(1 - s) of them, rounded up, beside a
-            probe; with 1 there are no probes.
-    """
+    """Points of entry of one object. `table`: radial density about the exit. `points`: uniform points of the object.
+    `area_share`: share s of the candidates that are uniform over the area: s/(1 - s) of them, rounded up, beside a
+    probe; with 1 there are no probes."""
 
     geometry: Geometry
     table: RadialTable
@@ -704,11 +679,7 @@ SHORTEST = 1e-4  # mean free paths of the densest channel; the first cell reache
 
 class RadialTable:
     """Mixture over the channels of the models' `pdf_position`, piecewise constant in r over cells even in log r.
-
-    Args:
-        models: one scalar model per channel, in scene units.
-        reach: largest distance, scene units.
-    """
+    `models`: one scalar model per channel, in scene units. `reach`: largest distance, scene units."""
 
     def __init__(self, models: list[BSSRDF], reach: float) -> None:
         densest = max(float(m.medium.sigma_t) for m in models)

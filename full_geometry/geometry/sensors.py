@@ -56,12 +56,8 @@ def rays_by(
     sensor: mi.Sensor, sampler: mi.Sampler, pixels: mi.UInt32 | None = None
 ) -> tuple[mi.Ray3f, mi.Spectrum, mi.Vector2f]:
     """Rays of all samples of each pixel, their weights, and their positions on the film.
-
-    Args:
-        sensor: its film has been prepared.
-        sampler: with a lane for each ray, pixel by pixel.
-        pixels: numbers of the pixels; all where None.
-    """
+    `sensor`: its film has been prepared. `sampler`: with a lane for each ray, pixel by pixel. `pixels`: numbers of the
+    pixels; all where None."""
     spp = sampler.sample_count()
     film, size = sensor.film(), sampled_size(sensor.film())
     border = film.rfilter().border_size() if film.sample_border() else 0
@@ -157,11 +153,8 @@ PASCAL = (0x55555555, 0x33333333, 0x0F0F0F0F, 0x00FF00FF, 0x0000FFFF)  # binom(c
 
 def path_numbers(seed: int, pixels: int, first: int, spp: int) -> mi.Sampler:
     """Numbers for the samples from `first` on of each pixel, beside each other.
-
-    Args:
-        seed: images of different seeds are independent.
-        first: number of the first sample of a pixel; those before it have been taken.
-    """
+    `seed`: images of different seeds are independent. `first`: number of the first sample of a pixel; those before it
+    have been taken."""
     return _numbers_class(mi.variant())(seed, pixels, first, spp)
 
 

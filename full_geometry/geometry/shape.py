@@ -45,10 +45,7 @@ class Faces:
 
 def faces_of(shape: mi.Shape, name: str) -> Faces | None:
     """The faces of a shape that is a mesh; None for others.
-
-    Raises:
-        ValueError: a surface of the mesh, called `name`, has one side only, as a Möbius strip has.
-    """
+    ValueError if a surface of the mesh, called `name`, has one side only, as a Möbius strip has."""
     if not mesh.has_faces(shape):
         return None
     faces, positions = mesh.face_vertices(shape), mesh.vertex_positions(shape).astype(float)
@@ -67,10 +64,7 @@ def faces_of(shape: mi.Shape, name: str) -> Faces | None:
 
 def check_copies(faces: Faces, name: str) -> None:
     """Refuse a mesh whose faces exist twice, in either winding: light would enter by both.
-
-    Raises:
-        ValueError: more than `MOST_COPIES` of the area is in copies of other faces.
-    """
+    ValueError if more than `MOST_COPIES` of the area is in copies of other faces."""
     corners = np.sort(faces.corners, axis=1)
     order = np.lexsort(corners.T)
     copies = np.zeros(len(corners), dtype=bool)
@@ -118,9 +112,7 @@ def _vertex_normals(positions: np.ndarray, vertex: np.ndarray, normals: np.ndarr
 
 def _edges(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The sides of all faces by the edges that they lie on, where each edge begins in these, and its number of sides.
-
-    Side 3 f + k runs from corner k of face f to the next. Sides of no length are on no edge.
-    """
+    Side 3 f + k runs from corner k of face f to the next. Sides of no length are on no edge."""
     ends = np.sort(np.stack([corners.ravel(), np.roll(corners, -1, axis=1).ravel()]), axis=0)
     order = np.lexsort(ends[::-1])
     order = order[ends[0, order] != ends[1, order]]
@@ -130,9 +122,7 @@ def _edges(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _neighbours(corners: np.ndarray, edges: tuple, solid: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pairs of faces that share an edge which no third one has, and whether they run along it in opposite ways.
-
-    Faces without area, which are not `solid`, have no side to agree with.
-    """
+    Faces without area, which are not `solid`, have no side to agree with."""
     order, first, count = edges
     pair = order[first[count == 2][:, None] + [0, 1]]
     pair = pair[solid[pair // 3].all(axis=1)]
@@ -148,10 +138,8 @@ def _pieces(corners: np.ndarray) -> np.ndarray:
 
 def _turned(n: int, first: np.ndarray, second: np.ndarray, same: np.ndarray, name: str) -> tuple:
     """Pieces over shared edges, and the sides by which their faces agree.
-
     In a graph of two nodes for each face, one for each side, an edge of the mesh joins the sides that agree. Both sides
-    of a piece are components of it; where they are one, the surface has one side only.
-    """
+    of a piece are components of it; where they are one, the surface has one side only."""
     other = np.where(same, 0, n)
     ends = np.concatenate([first, first + n]), np.concatenate([second + other, second + n - other])
     graph = coo_array((np.ones(2 * len(first)), ends), shape=(2 * n, 2 * n))
@@ -356,9 +344,7 @@ def matrix_of(to_world: mi.Transform4f) -> np.ndarray:
 
 class _Votes:
     """Votes of hits on each piece: the normals point outwards if they are against a ray that enters.
-
-    A ray from outside enters a closed object with its first, third, ... hit, whatever hides the piece.
-    """
+    A ray from outside enters a closed object with its first, third, ... hit, whatever hides the piece."""
 
     def __init__(self, faces: Faces | None) -> None:
         n = 0 if faces is None else int(faces.pieces.max()) + 1
@@ -430,10 +416,8 @@ def crossings(scene: mi.Scene, ray: mi.Ray3f, votes: _Votes | None = None) -> tu
 
 def meet_alone(scene: mi.Scene, ray: mi.Ray3f, flags: int, active: mi.Bool | bool = True) -> mi.SurfaceInteraction3f:
     """Intersect a ray with a scene of one shape, by the function of this shape.
-
     Mitsuba would have functions of all shapes that exist in the kernel, those of other scenes too; of a thousand
-    instances that takes minutes.
-    """
+    instances that takes minutes."""
     (shape,) = (each for each in scene.shapes()) if len(scene.shapes()) == 1 else (None,)
     if shape is None or is_instance(shape):
         return scene.ray_intersect(ray, flags, False, active)
@@ -529,10 +513,8 @@ def looked_up(table: mi.Int32, pointer: Pointer, otherwise: int, active: mi.Bool
 
 class SceneMark:
     """Tells a scene from others that the same objects may stand in; only OptiX has to know.
-
     Mitsuba lists the shapes of each scene in a variable, which is kept in place of the scene: that would never be
-    freed, and its address is given again once it is.
-    """
+    freed, and its address is given again once it is."""
 
     __hash__ = None
 
@@ -547,11 +529,8 @@ class SceneMark:
 
 def scene_of(shapes: list[mi.Shape], world: mi.Scene | None = None) -> mi.Scene:
     """A Mitsuba scene that holds these shapes, which keep their ids.
-
-    Args:
-        world: the scene that they stand in, if rays are traced in both by one kernel or one is an instance. It is not
-            kept alive, and must not be one that this function made.
-    """
+    `world`: the scene that they stand in, if rays are traced in both by one kernel or one is an instance. It is not
+    kept alive, and must not be one that this function made."""
     named = [*shapes, world] if world is not None and _by_optix() else shapes
     if world is not None and any(map(is_instance, shapes)):  # Mitsuba looks for their groups in the scene
         named = [*groups_of(world), *named]
@@ -609,14 +588,8 @@ def lines_through(box: mi.ScalarBoundingBox3f, n: int) -> mi.Ray3f:
 
 def check_together(world: mi.Scene, scenes: list[mi.Scene]) -> None:
     """Try rays in a scene and in those of objects in it by one kernel, where that may fail.
-
-    Args:
-        world: the scene around all.
-        scenes: from `scene_of`.
-
-    Raises:
-        RuntimeError: rays meet other things than by kernels of their own, or shapes that are not in their scene.
-    """
+    `world`: the scene around all. `scenes`: from `scene_of`. RuntimeError if rays meet other things than by kernels of
+    their own, or shapes that are not in their scene."""
     if not _by_optix():
         return
 

@@ -32,11 +32,8 @@ class Snapshot:
         cls, root: mi.Object, wanted: Callable[[str], bool] | None = None, without: tuple[type, ...] = ()
     ) -> Snapshot:
         """Take the snapshot of an object and all that it holds.
-
-        Args:
-            wanted: whether a parameter of this name counts; by default all do.
-            without: classes of objects that do not count.
-        """
+        `wanted`: whether a parameter of this name counts; by default all do. `without`: classes of objects that do not
+        count."""
         parameters, checksums = mi.traverse(root), {}
         for key, value in parameters.items():
             if not isinstance(parameters.properties[key][2], without) and (wanted is None or wanted(key)):
@@ -108,10 +105,8 @@ _LEFT_OUT = re.compile(
 
 def scene_hash(scene: mi.Scene, integrator: mi.Integrator) -> str:
     """SHA-256 of the objects of a scene, in words and by all their parameters, and of the integrator that renders it.
-
     The integrator of the scene itself, ids, the order of objects and the number of samples of a sampler are left out.
-    For the weights of models see `scenes.reference.learnt`.
-    """
+    For the weights of models see `scenes.reference.learnt`."""
     own = scene.integrator()
     result = sorted(object_digest(child) for child in children(scene) if child is not own)
     return hashlib.sha256("\n".join([*result, words(integrator)]).encode()).hexdigest()

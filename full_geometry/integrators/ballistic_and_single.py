@@ -138,9 +138,7 @@ def sample_one_event(
     active: mi.Bool,
 ) -> OneEventSample:
     """Light that leaves at an exit after at most one scattering event.
-
-    What passes unscattered shows delta lights only if the path has `scattered` before.
-    """
+    What passes unscattered shows delta lights only if the path has `scattered` before."""
     if obj.gathered is not None and obj.gathered.inner is not None:
         return _by_inner_light(context, obj, refracted, sampler, scattered, active)
     with dr.suspend_grad():
@@ -386,9 +384,7 @@ def _scatter(
     scattering: mi.Float, sampler: mi.Sampler,
 ) -> OneEventWalk:  # fmt: skip
     """The event on this segment, which happens with the probability `scattering`.
-
-    `weights` are W_c = f_c / p and 1 - T_c, the probability of channel c to be scattered on the segment.
-    """
+    `weights` are W_c = f_c / p and 1 - T_c, the probability of channel c to be scattered on the segment."""
     # ---- distance by a channel c of probability W_c (1 - T_c): s = -ln(1 - u (1 - T_c)) / sigma_t, or of 2 sigma_t
     W, ends = weights
     u, v, channel, scatters = sampler.next_1d(), sampler.next_2d(), sampler.next_2d(), W * ends
@@ -435,12 +431,8 @@ def _direction_pdf(
     obj: TranslucentObject, m: Coefficients, W: mi.Spectrum, cosine: mi.Float, outwards: mi.Float
 ) -> mi.Float:
     """Density of the direction of an event, 1/sr: Σ_c W_c p_c(cosine) / Σ_c W_c, mixed with the cone outwards.
-
-    Args:
-        obj, m: the object, and its coefficients at the event.
-        W: weights of the channels.
-        cosine, outwards: of the direction to that of arrival and to the normal outwards.
-    """
+    `obj`, `m`: the object, and its coefficients at the event. `W`: weights of the channels. `cosine`, `outwards`: of
+    the direction to that of arrival and to the normal outwards."""
     least = _least_outwards(obj)
     phase = dr.sum(W * eval_phase(m, cosine)) / dr.maximum(dr.sum(W), 1e-30)
     return (1 - OUTWARDS) * phase + dr.select(outwards > least, OUTWARDS / (2 * dr.pi * (1 - least)), 0)
@@ -597,9 +589,7 @@ def _phase_pdf(obj: TranslucentObject, walk: OneEventWalk, met: Connection) -> m
 
 def _environment_pdf(obj: TranslucentObject, walk: OneEventWalk, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
     """Density of a walk's direction outside, 1/sr, and 1, where a connection with the environment leads along it.
-
-    Elsewhere 1 and 0.
-    """
+    Elsewhere 1 and 0."""
     with dr.suspend_grad():
         # p_f per solid angle outside: p(d) T dw_inside / dw_outside of the connection along the way of the walk
         reach = opaque(FAR * obj.geometry.size)
@@ -679,10 +669,8 @@ def _ways(
     context: RenderContext, at: LitEvent, target: _Target, looks: tuple[mi.Bool, mi.Bool], sampler: mi.Sampler
 ) -> list[_Way]:
     """The ways of light of a target: from the first guess, and from random directions, without and with a reflection.
-
     One loop over all, so that a kernel holds Newton's method once. `looks` says where it looks for the first, and for
-    the others. Which are looked for again is decided by the medium itself, also where another is differentiated by.
-    """
+    the others. Which are looked for again is decided by the medium itself, also where another is differentiated by."""
     obj, p_event = at.obj, at.walk.event.p
     m = _coefficients(obj, at.walk.medium)
 

@@ -231,10 +231,8 @@ def shown(scene: mi.Scene, objects: list[TranslucentObject], settings: Settings,
 @contextmanager
 def undisturbed() -> Iterator[None]:
     """No garbage collection while a kernel is recorded.
-
     It would free objects of earlier scenes. A call that is recorded before that has other targets than the same call
-    after it, and Dr.Jit then writes the same function twice, which LLVM refuses.
-    """
+    after it, and Dr.Jit then writes the same function twice, which LLVM refuses."""
     collects = gc.isenabled()
     gc.disable()
     try:
@@ -267,10 +265,8 @@ def is_independent(sampler: mi.Sampler) -> bool:
 
 def launches(sensor: mi.Sensor, spp: int) -> Iterator[Launch]:
     """Launches of about equally many samples, each to be rendered to the film of a sensor.
-
     Only samples of the sampler `independent` are split, as those of `path_numbers` go on in the next launch. Other
-    samplers round the samples of each launch up to a square or another number of strata: they have one launch.
-    """
+    samplers round the samples of each launch up to a square or another number of strata: they have one launch."""
     spp = checked_samples(sensor, spp)
     # n launches of about `SAMPLES_PER_LAUNCH`, the first and last sample of each
     n = min(math.ceil(spp * int(dr.prod(sensor.film().crop_size())) / SAMPLES_PER_LAUNCH), spp)
@@ -284,11 +280,8 @@ def launches(sensor: mi.Sensor, spp: int) -> Iterator[Launch]:
 
 def check_parameters(scene: mi.Scene) -> None:
     """Refuse derivatives that a replay with fixed paths does not have.
-
-    Raises:
-        ValueError: gradients are enabled for the geometry of a shape, for a sensor or film, or for what Mitsuba does
-            not differentiate by, such as the index of a smooth dielectric.
-    """
+    ValueError if gradients are enabled for the geometry of a shape, for a sensor or film, or for what Mitsuba does not
+    differentiate by, such as the index of a smooth dielectric."""
     parameters = mi.traverse(scene)
     for key, (_, _, owner, flags) in parameters.properties.items():
         with dr.resume_grad():
@@ -306,10 +299,7 @@ def check_parameters(scene: mi.Scene) -> None:
 
 def check_outermost(scene: mi.Scene) -> None:
     """Refuse derivatives of another integrator that asks this one for samples: they would be missing in silence.
-
-    Raises:
-        ValueError: gradients are enabled for a parameter of the scene, and followed.
-    """
+    ValueError if gradients are enabled for a parameter of the scene, and followed."""
     followed = [key for key, value in mi.traverse(scene).items() if dr.grad_enabled(value)]
     if followed:
         raise ValueError(
@@ -343,10 +333,7 @@ def _selects(parameters: mi.SceneParameters, owner: mi.Object | None, name: str)
 
 def replayer(objects: list[TranslucentObject], settings: Settings) -> mi.Integrator:
     """An integrator of Mitsuba's radiative backpropagation around the paths through a scene with these objects.
-
-    Raises:
-        ValueError: as of `TranslucentObject.prepare_derivatives`.
-    """
+    ValueError as of `TranslucentObject.prepare_derivatives`."""
     from mitsuba.python.ad.integrators.common import RBIntegrator
 
     for obj in objects:

@@ -39,12 +39,8 @@ def inner_light(
     others: tuple[SurfacePoints, mi.Float],
 ) -> InnerLight:  # fmt: skip
     """J of object k.
-
-    Args:
-        scene, objects, settings: what is rendered.
-        events: of the object.
-        others: points of its surface, and the mean radiance of the other surfaces that each of them sees, by channel.
-    """
+    `scene`, `objects`, `settings`: what is rendered. `events`: of the object. `others`: points of its surface, and the
+    mean radiance of the other surfaces that each of them sees, by channel."""
     # ---- n directions for each event, one lane each
     context, obj, count = RenderContext.of(scene, objects, settings, Primal()), objects[k], dr.width(events.p)
     sky = scene.environment()

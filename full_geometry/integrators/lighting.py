@@ -70,10 +70,7 @@ class Primal:
 @dataclass(frozen=True)
 class Replay:
     """The second pass: radiance is taken away again, and each factor is differentiated.
-
-    Args:
-        backward: whether adjoints are handed on to the parameters, or derivatives of parameters to the radiance.
-    """
+    `backward`: whether adjoints are handed on to the parameters, or derivatives of parameters to the radiance."""
 
     backward: bool
     tracks = True
@@ -171,10 +168,8 @@ class EnvironmentMean(NamedTuple):
     @classmethod
     def of(cls, scene: mi.Scene, lights: Lights, objects: list[TranslucentObject]) -> EnvironmentMean | None:
         """c of a scene; None without an environment, without an object that has `alpha`, or where c is of little use.
-
-        c is left out where it is not most of the light in the square, as under a sun: it costs time there and takes
-        no noise away.
-        """
+        c is left out where it is not most of the light in the square, as under a sun: it costs time there and takes no
+        noise away."""
         emitter = scene.environment()
         if emitter is None or all(obj.alpha is None for obj in objects):
             return None

@@ -138,10 +138,8 @@ def _loop(
     derivative: mi.Spectrum | tuple[()], active: mi.Bool, scattered: bool = False, passes: bool = True,
 ) -> tuple[tuple[mi.Spectrum, mi.Spectrum], PathRadiance, mi.Bool]:  # fmt: skip
     """All vertices of a path, in one or two passes: L, what is summed, and whether the camera ray hits anything.
-
     Where the first vertex is on an object with orders 0 and 1 and others, the path begins there a second time for
-    orders 0 and 1: the choice between both was most of the variance under an environment.
-    """
+    orders 0 and 1: the choice between both was most of the variance under an environment."""
     settings, mode = context.settings, context.mode
     camera_ray = mi.Ray3f(camera_ray)
     max_depth = 0xFFFFFFFF if settings.max_depth < 0 else settings.max_depth
@@ -253,9 +251,7 @@ def weighted_emission(
     shown: mi.Bool, scattered: mi.Bool, active: mi.Bool,
 ) -> mi.Spectrum:  # fmt: skip
     """Emitted light where a ray arrives, with its MIS weight against next-event estimation at the previous vertex.
-
-    Emitters count where they are `shown`; delta lights behind a mirror if the path has `scattered` before.
-    """
+    Emitters count where they are `shown`; delta lights behind a mirror if the path has `scattered` before."""
     with dr.suspend_grad():
         # emitters that next-event estimation or connections at the last vertex have not counted
         emitter, mirrored = si.emitter(context.scene, active), active & previous.mirrored & scattered
@@ -385,12 +381,9 @@ def sample_event(
 
 
 def choose_event(obj: TranslucentObject, si: mi.SurfaceInteraction3f, active: mi.Bool) -> EventChoice:
-    """Probabilities of the events by the light that is expected of each.
-
-    With T the mean transmittance along the refracted ray to the other side, R_1 and R_2 the reflectances of the
-    half-space by single scattering and more, and albedo a, the expected light is T of order 0,
-    (1 - T) (R_1 + (a - R_1) T) of order 1 and (1 - T) R_2 of the rest.
-    """
+    """Probabilities of the events by the light that is expected of each. With T the mean transmittance along the
+    refracted ray to the other side, R_1 and R_2 the reflectances of the half-space by single scattering and more, and
+    albedo a, the expected light is T of order 0, (1 - T) (R_1 + (a - R_1) T) of order 1 and (1 - T) R_2 of the rest."""
     # ---- the ray refracted into the object: d = -w / eta + n (mu / eta - mu')
     out = exit_at(obj, si)
     mu = dr.dot(out.w, out.n_out)
@@ -437,9 +430,7 @@ def exit_at(obj: TranslucentObject, si: mi.SurfaceInteraction3f) -> SurfacePoint
 
 def _where(context: RenderContext, sampler: mi.Sampler, mask: mi.Bool, otherwise: tuple, event: Callable) -> tuple:
     """`event(*otherwise)` where the mask holds, elsewhere `otherwise`.
-
-    An event that no neighbouring lane asks for is not computed. Derivatives do not leave the event.
-    """
+    An event that no neighbouring lane asks for is not computed. Derivatives do not leave the event."""
 
     # a branch of the kernel; derivatives are followed inside and end there
     def happens(sampler: mi.Sampler, otherwise: tuple) -> tuple:
@@ -502,9 +493,7 @@ def _scatter_outside(
     context: RenderContext, sampler: mi.Sampler, at: Vertex, radiance: PathRadiance, choices: list
 ) -> tuple[NextVertex, PathRadiance, Taken]:
     """The BSDF. At an object, emission that it mirrors is added whatever is chosen, as highlights are bright.
-
-    The path goes on from there if the mirrored ray meets a surface and reflection is chosen.
-    """
+    The path goes on from there if the mirrored ray meets a surface and reflection is chosen."""
     # ---- where there is an object, its probability of reflection, and where it may reflect in this pass
     u_event = sampler.next_1d()
     inside, glossy, reflection = mi.Bool(False), mi.Bool(False), mi.Float(0)
@@ -554,10 +543,8 @@ def _add_mirrored(
     active: mi.Bool,
 ) -> tuple[mi.Spectrum, mi.Bool, PathRadiance]:
     """Add emission that an object mirrors.
-
-    Returns:
-        Emission over the weight of the reflection, whether the ray meets a surface, and the radiance of the path.
-    """
+    Returns emission over the weight of the reflection, whether the ray meets a surface, and the radiance of the
+    path."""
 
     def look(_: mi.Spectrum, __: mi.Bool, radiance: PathRadiance) -> tuple[mi.Spectrum, mi.Bool, PathRadiance]:
         # L += throughput F L_e along the mirrored ray
@@ -602,9 +589,7 @@ def _differentiable(
     active: mi.Bool,
 ) -> mi.Spectrum:  # fmt: skip
     """The weight of a sampled direction with the derivative of the BSDF there, the density held.
-
-    A delta lobe has no value to ask for: its weight times the probability of the lobe has the derivative.
-    """
+    A delta lobe has no value to ask for: its weight times the probability of the lobe has the derivative."""
     # delta lobes: weight P(lobe) / detached P(lobe); others: f(w) cos / p(w), w and p held
     pdf = dr.detach(bs.pdf)
     inverse = dr.select(pdf > 0, dr.rcp(pdf), 0)
@@ -626,10 +611,8 @@ def one_event(
     active: mi.Bool,
 ) -> tuple[NextVertex, mi.Spectrum, mi.Spectrum]:
     """Light that was scattered at most once inside, and emitter connections of that event.
-
     c of `lighting.EnvironmentMean` is taken off the former where `_add_environment_means` has added alpha c. Last comes
-    what of the light phase sampling alone has hit.
-    """
+    what of the light phase sampling alone has hit."""
     # the way out of the walk is the next vertex; light of connections is added at this one
     sample = sample_one_event(context, obj, refracted, sampler, scattered, active)
     previous = PreviousVertex(
@@ -655,10 +638,8 @@ def bssrdf_event(
     active: mi.Bool,
 ) -> tuple[NextVertex, mi.Spectrum, mi.Spectrum]:
     """Light that entered elsewhere and leaves at `out` by the transport of the object.
-
     Delta lights are its next-event estimation. c of `lighting.EnvironmentMean` is taken off where
-    `_add_environment_means` has added alpha c.
-    """
+    `_add_environment_means` has added alpha c."""
     # ---- an entry x_i and a direction w_i, of weight S mu_i / p
     entry = resample_entry(context, obj, out, face, sampler, active)
     # ---- control variate: -S mu_i c / p, of the share that directions of the environment have
@@ -762,10 +743,8 @@ def _draw_candidate(
     sampler: mi.Sampler, active: mi.Bool,
 ) -> Candidate:  # fmt: skip
     """A point of entry by the proposals, and a direction by emitters or by the proposals (one-sample MIS).
-
     The choice between both is the same for all candidates of an exit: `by_emitter`, drawn where it is None. Under an
-    environment alone the direction is one of several, see `_towards_environment`.
-    """
+    environment alone the direction is one of several, see `_towards_environment`."""
     share, proposals, out = context.lights.entry_share, obj.proposals, exit_point.out
 
     # ---- x_i and a direction that may meet anything, of density (1 - share) p_i

@@ -317,11 +317,8 @@ def _one_thread() -> Iterator[None]:
 
 def _check_followed(scene: mi.Scene) -> None:
     """Refuse derivatives that scores of walks do not have.
-
-    Raises:
-        ValueError: gradients are enabled for another parameter than albedo, sigma_t and g of translucent surfaces and
-            what their textures show, or a delta light stands inside an object.
-    """
+    ValueError if gradients are enabled for another parameter than albedo, sigma_t and g of translucent surfaces and
+    what their textures show, or a delta light stands inside an object."""
     # ---- parameters whose scores walks know: of translucent surfaces, their textures, and attributes that these show
     parameters, owners, attributes = mi.traverse(scene), [], set()
     for shape in translucent_shapes(scene):
@@ -410,9 +407,7 @@ def _launch(
 
 def _glints(tracer: PathTracer, sensor: mi.Sensor, seed: int, spp: int) -> mi.UInt32 | None:
     """Pixels in which emission seen in objects varies much more than other light; None where it is met by chance.
-
-    Only of box filters, which do not ask where in a pixel light is.
-    """
+    Only of box filters, which do not ask where in a pixel light is."""
     film = sensor.film()
     if tracer.visitor.unscattered is None or not film.rfilter().is_box_filter():
         return None

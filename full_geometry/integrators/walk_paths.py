@@ -77,12 +77,8 @@ class LightRecord:
 
 class Seen(NamedTuple):
     """Emission that is found without chance along one way from a boundary.
-
-    Args:
-        light: of that way, with the throughput.
-        found: whether it is found.
-        kept: probability that a path does not take that way; 1 where it may meet surfaces there.
-    """
+    `light`: of that way, with the throughput. `found`: whether it is found. `kept`: probability that a path does not
+    take that way; 1 where it may meet surfaces there."""
 
     light: mi.Spectrum
     found: mi.Bool
@@ -369,10 +365,8 @@ class LightVisitor:
 
     def emitter_behind(self, walk: Walk, si: mi.SurfaceInteraction3f, k: mi.Int32, active: mi.Bool) -> Seen:
         """What is seen through object k without reflection inside, which no free flight then meets.
-
-        The light is (1 - F) T (1 - F') L_e, F of the boundary and F' of that on the other side, and what flights keep
-        1 - T (1 - F').
-        """
+        The light is (1 - F) T (1 - F') L_e, F of the boundary and F' of that on the other side, and what flights keep 1
+        - T (1 - F')."""
         # ---- the refracted direction with 1 - F, and the boundary on its way
         media, ctx = self.media, mi.BSDFContext()
         ctx.type_mask = mi.BSDFFlags.DeltaTransmission
@@ -877,11 +871,7 @@ class FirstExitRecord:
 @dataclass(frozen=True, eq=False)
 class FirstExitVisitor:
     """Another visitor, beside which the first exit of each path is stored at the number of the path.
-
-    Args:
-        visitor: the other one.
-        exits: where they are stored.
-    """
+    `visitor`: the other one. `exits`: where they are stored."""
 
     visitor: Visitor
     exits: FirstExits

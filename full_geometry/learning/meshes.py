@@ -134,9 +134,7 @@ def ring_noise(angle: np.ndarray, seed: int) -> np.ndarray:
 
 def cells(p: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Distance to the nearest and to the second nearest of random points, one per unit cube, and the nearest's number.
-
-    The number is in [0, 1) (Worley 1996).
-    """
+    The number is in [0, 1) (Worley 1996)."""
     lattice = np.floor(p).astype(np.int64)
     first, second = np.full((2, *p.shape[:-1]), np.inf)
     number = np.zeros(p.shape[:-1])
@@ -180,16 +178,9 @@ class Box:
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A closed surface of triangles.
-
-    Args:
-        vertices: (n, 3), mm.
-        faces: (m, 3) indices, counterclockwise seen from outside.
-
-    Raises:
-        ValueError: an edge is not shared by two faces that run along it in opposite directions, a triangle has no area,
-            or the volume is not above 0, which faces wound inwards give.
-    """
+    """A closed surface of triangles. `vertices`: (n, 3), mm. `faces`: (m, 3) indices, counterclockwise seen from
+    outside. ValueError if an edge is not shared by two faces that run along it in opposite directions, a triangle has
+    no area, or the volume is not above 0, which faces wound inwards give."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -220,9 +211,7 @@ class Mesh:
 
     def mitsuba(self, name: str) -> mi.Mesh:
         """The mesh as a diffuse shape of Mitsuba, with smooth normals.
-
-        Normals by libigl: Mitsuba adds them up in the order of its threads, which differs in the last bit.
-        """
+        Normals by libigl: Mitsuba adds them up in the order of its threads, which differs in the last bit."""
         import igl
         import mitsuba as mi
 

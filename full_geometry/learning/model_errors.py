@@ -88,11 +88,7 @@ def _passes(n_exits: int, per_exit: int) -> list[int]:
 
 def reference(obj: TranslucentObject, exits: int = 256, walks: int = 8192, seed: int = 0, fewest: int = 2) -> ExitTruth:
     """Exits and their radiance by walks.
-
-    Args:
-        exits, walks: number of exits, and of walks of each; seed: of both.
-        fewest: scattering events that count.
-    """
+    `exits`, `walks`: number of exits, and of walks of each; seed: of both. `fewest`: scattering events that count."""
     for name, value, least in (("exits", exits, 2), ("walks", walks, 2), ("seed", seed, 0)):
         check_count(name, value, least)
     points = obj.random_points(generator(mi, exits, pass_seed(seed, 17)))
@@ -119,11 +115,7 @@ def modelled(
     transport: Transport, proposals: EntryProposals, exits: SurfacePoint, samples: int, seed: int = 0
 ) -> ExitRadiance:
     """Radiance of exits by a model.
-
-    Args:
-        proposals: where its entries are drawn.
-        samples, seed: entries of each exit; of the entries.
-    """
+    `proposals`: where its entries are drawn. `samples`, `seed`: entries of each exit; of the entries."""
     n = dr.width(exits.p)
     sums = _Sums(n)
     table = WeightTable.of(proposals.patches, exits) if proposals.patches else None
@@ -292,11 +284,8 @@ def errors(
 
 def transport_of(obj: TranslucentObject, model: str, folder: str | os.PathLike | None = None) -> Transport:
     """The transport called `model` of an object: "full_geometry", one that a package adds, or a half-space model.
-
-    Raises:
-        ValueError: the object has not been trained, there is no such model, it refuses the object as renders would, or
-            it has no S for two points of a surface.
-    """
+    ValueError if the object has not been trained, there is no such model, it refuses the object as renders would, or it
+    has no S for two points of a surface."""
     inclusions, entry = obj.geometry.inclusions, lookup(model)
     if inclusions is not None and not entry.capabilities.inclusions:
         refuse(inclusions.found[0], obj.geometry, f"the model {model!r}")
@@ -334,14 +323,8 @@ class MeanRatio(NamedTuple):
 
 def mean_ratios(scene: mi.Scene, image: np.ndarray, sensor: int = 0, seed: int = 0) -> list[MeanRatio]:
     """The ratio of each translucent object that enough places of the film show.
-
-    Args:
-        scene: whose integrator tells mm_per_unit and max_depth.
-        image: (height, width, channels) radiance by a model, of the whole crop.
-
-    Raises:
-        ValueError: the scene cannot be walked.
-    """
+    `scene`: whose integrator tells mm_per_unit and max_depth. `image`: (height, width, channels) radiance by a model,
+    of the whole crop. ValueError if the scene cannot be walked."""
     # ---- rays through random places of the film, and the objects they meet
     camera, numbers = scene.sensors()[sensor], np.random.default_rng(seed)
     place = numbers.random((2, WALKS), dtype=np.float32)

@@ -92,11 +92,7 @@ class NamedNetwork(nn.Module):
 
 class Correction(NamedNetwork):
     """f = 6 tanh(g/6) per channel, g a perceptron; 0 initially.
-
-    Args:
-        n_in: features.
-        channels: outputs.
-    """
+    `n_in`: features. `channels`: outputs."""
 
     NAMES = ("W", "b")
 
@@ -116,24 +112,15 @@ class Correction(NamedNetwork):
 
 def likelihood(walks: tuple, proposals: tuple, kept: float) -> torch.Tensor:
     """E_q[(S_0 mu_i / q) exp f] - E_walks[T f], sum over channels.
-
-    Args:
-        walks: f and T, (channels, n) both.
-        proposals: f and S_0 mu_i / q, (channels, m) both.
-        kept: share of all walks that the n stand for.
-    """
+    `walks`: f and T, (channels, n) both. `proposals`: f and S_0 mu_i / q, (channels, m) both. `kept`: share of all
+    walks that the n stand for."""
     (f, T), (g, W) = walks, proposals
     return ((W * torch.exp(g)).mean(dim=1) - kept * (T * f).mean(dim=1)).sum()
 
 
 class AlbedoNetwork(NamedNetwork):
     """F_t P sigmoid(a) of orders one, then two and more, per channel, a a perceptron of the exit.
-
-    Args:
-        n_in: features of an exit.
-        hidden: widths of the hidden layers.
-        eta: relative index.
-    """
+    `n_in`: features of an exit. `hidden`: widths of the hidden layers. `eta`: relative index."""
 
     NAMES = ("A", "a")
 
@@ -177,24 +164,14 @@ class AlbedoNetwork(NamedNetwork):
 
 def mean_likelihood(both: tuple, T: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
     """E[alpha - T log alpha] over walks, sum over channels times their scale; its minimum is alpha = E[T | exit].
-
-    Args:
-        both: from `AlbedoNetwork`.
-        T: (2 channels, n).
-        scale: (2 channels, 1).
-    """
+    `both`: from `AlbedoNetwork`. `T`: (2 channels, n). `scale`: (2 channels, 1)."""
     alpha, log_alpha = both
     return (scale * (alpha - T * log_alpha)).mean(dim=1).sum()
 
 
 class PatchLogits(NamedNetwork):
     """log p(patch | exit) up to a constant; initially the shares of the area, which its arrays are without.
-
-    Args:
-        n_in: features of an exit.
-        areas: of the patches.
-        hidden: widths of the hidden layers.
-    """
+    `n_in`: features of an exit. `areas`: of the patches. `hidden`: widths of the hidden layers."""
 
     NAMES = ("V", "c")
 
@@ -300,9 +277,7 @@ class ObjectFit:
 
     def set_scale(self, walks: Pairs) -> None:
         """Divide each channel by its mean throughput, so that all count alike; alpha begins with the mean.
-
-        Order one counts as a part of all light: where it hardly leaves, its few large values would drown the rest.
-        """
+        Order one counts as a part of all light: where it hardly leaves, its few large values would drown the rest."""
         self.scale = _inverse(self._tensor(walks.values.sum(axis=1) / walks.drawn))
         exits, T = (self._tensor(v) for v in walks.albedo)
         mean = T.mean(dim=1)
@@ -313,11 +288,7 @@ class ObjectFit:
 
     def start(self, arrays: Mapping[str, np.ndarray], walks: Pairs) -> None:
         """Begin with weights of the same recipe; alpha keeps the mean that `set_scale` gave it.
-
-        Args:
-            arrays: of the networks, as `arrays` names them.
-            walks: of the pilot.
-        """
+        `arrays`: of the networks, as `arrays` names them. `walks`: of the pilot."""
         for networks in (self.modules, self.average):
             with torch.no_grad():
                 for module in networks.values():
@@ -359,11 +330,7 @@ class ObjectFit:
 
     def solve(self, source: PairSource, chunks: int, seed: int) -> None:
         """Find what the averaged fit lacks of exits and entries, see `Ends`, by proposals that it has not seen.
-
-        Args:
-            source: of the proposals.
-            chunks: of the training; half as many are made.
-        """
+        `source`: of the proposals. `chunks`: of the training; half as many are made."""
         for k in range(max(round(SOLVED * chunks), 1)):
             made = source.proposed(PROPOSED * self.recipe.chunk, (seed, BEYOND + k))
             with torch.no_grad(), torch_threads():
@@ -420,10 +387,7 @@ class ObjectFit:
 
     def load(self, path: Path) -> tuple[int, list]:
         """Go on from a checkpoint; returns its chunks and history.
-
-        Raises:
-            ValueError: it is damaged or of another recipe.
-        """
+        ValueError if it is damaged or of another recipe."""
         with gone_on_with(path, self._tensors()) as stored:
             self.descent.steps, done = (int(v) for v in stored["counters"].tolist())
             history = [(int(k), error, spread) for k, error, spread in stored["history"].tolist()]
@@ -453,10 +417,7 @@ COLUMNS = 8192  # columns at once
 
 class Ends:
     """Sums over walks and proposals of some channels.
-
-    Args:
-        n: features of a side.
-    """
+    `n`: features of a side."""
 
     def __init__(self, channels: int, n: int, device: torch.device) -> None:
         self.n = n

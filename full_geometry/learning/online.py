@@ -174,9 +174,7 @@ def _learnt(
 
 def _join(scene: mi.Scene) -> bool:
     """Whether walks show what the models show: all objects are learnt and unmasked, and paths go past an object.
-
-    Exits on instances are of several places, and no data for learning.
-    """
+    Exits on instances are of several places, and no data for learning."""
     shapes, own = outermost(scene), scene.shapes()
     alone = all(any(shape is each for each in own) for shape in shapes)
     around = map(wrapping_of, shapes)

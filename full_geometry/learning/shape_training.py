@@ -58,12 +58,7 @@ MOST_OFF = 3.0  # of the light of a group: what is far too bright has its say by
 @dataclass(frozen=True)
 class ShapeRecipe:
     """How the network is fitted.
-
-    Args:
-        objects: of a batch.
-        pairs: walks, and proposals, of each; at least two.
-        rate: largest learning rate.
-    """
+    `objects`: of a batch. `pairs`: walks, and proposals, of each; at least two. `rate`: largest learning rate."""
 
     width: int = 64
     depth: int = 3
@@ -133,10 +128,7 @@ def _halves(values: torch.Tensor, counts: list[int]) -> torch.Tensor:
 
 class ShapeFit:
     """The state of a fit, which follows from recipe, seed, number of steps and data.
-
-    Args:
-        recipe: sizes and rates.
-    """
+    `recipe`: sizes and rates."""
 
     def __init__(self, recipe: ShapeRecipe, seed: int) -> None:
         self.recipe = recipe
@@ -150,19 +142,13 @@ class ShapeFit:
 
     def advance(self, pool: list[GroupedPairs], rng: np.random.Generator, part: float) -> float:
         """One step on random parts of random objects; returns the loss.
-
-        Args:
-            pool: data to draw from.
-            part: of the whole fit that is done, for the decay of the rate.
-        """
+        `pool`: data to draw from. `part`: of the whole fit that is done, for the decay of the rate."""
         loss = self.loss([pool[k] for k in rng.integers(0, len(pool), self.recipe.objects)], rng)
         return self.descent.step(loss, cosine(self.recipe.rate * warm_up(self.step, WARM_UP), part, LAST_RATE))
 
     def loss(self, batch: list[GroupedPairs], rng: np.random.Generator) -> torch.Tensor:
         """E_q[(S_0 mu_i / q) exp f] - E_walks[T f] over the mean of T, and the light of groups; a mean over objects.
-
-        A part of one group of the exits of each object is taken.
-        """
+        A part of one group of the exits of each object is taken."""
         parts = [data.part(self.recipe.pairs, rng) for data in batch]
         T, W = (torch.from_numpy(np.concatenate(v)).float() for v in zip(*((p.T, p.W) for p in parts)))
         counts = [len(p.T) for p in parts] + [len(p.W) for p in parts]
@@ -186,10 +172,7 @@ class ShapeFit:
 
     def load(self, path: Path) -> int:
         """Go on from a checkpoint; returns its chunks.
-
-        Raises:
-            ValueError: it is damaged or of another recipe.
-        """
+        ValueError if it is damaged or of another recipe."""
         with gone_on_with(path, self.descent.tensors()) as stored:
             self.descent.steps, done = (int(v) for v in stored["counters"].tolist())
         return done
@@ -361,10 +344,7 @@ DENSE_SHARE, CONSERVATIVE_SHARE, LEAST_ABSORPTION = 0.75, 0.04, 1e-4
 @dataclass(frozen=True, eq=False)
 class Drawn:
     """A shape filled with a medium.
-
-    Args:
-        family: of the shape, or the name of the mesh.
-    """
+    `family`: of the shape, or the name of the mesh."""
 
     family: str
     object: TranslucentObject
@@ -377,10 +357,8 @@ class Drawn:
 
 def draw_medium(rng: np.random.Generator) -> tuple[float, float, float]:
     """Albedo, g and eta of a medium.
-
     Reduced albedo: three in four log-uniform in its distance to 1 down to 1e-4, the rest uniform; one in 25 is 1. g: 45
-    in 100 are 0, the others uniform. eta: uniform, one in twenty 1.
-    """
+    in 100 are 0, the others uniform. eta: uniform, one in twenty 1."""
     dense = rng.random() < DENSE_SHARE
     reduced = 1 - LEAST_ABSORPTION ** rng.random() if dense else rng.uniform(*ALBEDO)
     reduced = 1.0 if rng.random() < CONSERVATIVE_SHARE else max(reduced, ALBEDO[0])
@@ -393,12 +371,8 @@ def draw_object(
     seed: Sequence[int], families: Mapping[str, Family] | None = None, meshes: Sequence[Path] = ()
 ) -> Drawn:
     """A random shape with a random medium.
-
-    Args:
-        seed: numbers that it follows from.
-        families: generators by name; by default those of training, with spheres and the meshes among them.
-        meshes: PLY files that some of the shapes are taken from.
-    """
+    `seed`: numbers that it follows from. `families`: generators by name; by default those of training, with spheres and
+    the meshes among them. `meshes`: PLY files that some of the shapes are taken from."""
     rng = np.random.default_rng(list(seed))
     u, path = rng.random(2), meshes[int(rng.integers(len(meshes)))] if meshes else None
     made = TRAINING if families is None else families
@@ -470,11 +444,7 @@ class PairData:
 
 def make_data(obj: TranslucentObject, events: float, seed: tuple[int, ...]) -> PairData | None:
     """Walks and proposals of an object; None if too few walks leave it.
-
-    Args:
-        obj: the object, of one channel or of equal ones.
-        events: of a walk, about, which limits the number of walks.
-    """
+    `obj`: the object, of one channel or of equal ones. `events`: of a walk, about, which limits the number of walks."""
     n = int(np.clip(EVENTS / events, FEWEST_WALKS, WALKS))
     starts = obj.random_points(generator(mi, n, pass_seed(*seed, 0)))
     exits = trace_exits(obj, starts, (*seed, 1))

@@ -120,11 +120,7 @@ class CameraSchedule(NamedTuple):
 
 class CameraExits:
     """The part of each chunk that comes from the camera.
-
-    Args:
-        source: of the pairs.
-        walks: of a chunk, those of the camera included.
-    """
+    `source`: of the pairs. `walks`: of a chunk, those of the camera included."""
 
     def __init__(self, source: PairSource, camera: CameraWalks, walks: int, seed: int) -> None:
         self.source, self.camera, self.walks, self.seed = source, camera, walks, seed

@@ -54,13 +54,8 @@ class Inclusion:
 
 def find_inclusions(scene: mi.Scene, objects: list[Geometry]) -> list[Inclusion]:
     """Find what lies inside each closed object of a scene: shapes with a part deeper than `DEEP`, and lamps.
-
-    What shines or lets light through counts from the depth on that rays tell.
-
-    Raises:
-        ValueError: the surface of such a shape lies on that of an object, so that rays do not tell which comes first;
-            or it is a thin wall.
-    """
+    What shines or lets light through counts from the depth on that rays tell. ValueError if the surface of such a shape
+    lies on that of an object, so that rays do not tell which comes first; or it is a thin wall."""
     groups, results = shown_groups(scene), []
     holders = InstanceTable.of([obj.shape for obj in objects], groups)
     things = InstanceTable.of(shapes_of(scene, groups), groups)
@@ -167,9 +162,7 @@ def _into(to_world: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 def _points_in(alone: mi.Scene, pairs: _Pairs) -> tuple[np.ndarray, np.ndarray]:
     """Points in the boxes of pairs, of the shape in a scene of its own: numbers of the pairs, and shape (3, n).
-
-    Points that rays into the box meet first, and points by area, without which wires are missed.
-    """
+    Points that rays into the box meet first, and points by area, without which wires are missed."""
     n, inverse = len(pairs.i), np.linalg.inv(pairs.thing)
     start, along = ways_into(pairs.low, pairs.high, LOOKS)
     start, along = inverse[:, :3, :3] @ start + inverse[:, :3, 3:], inverse[:, :3, :3] @ along
@@ -289,10 +282,7 @@ def place_of(emitter: mi.Emitter) -> np.ndarray | None:
 
 def check_sensors(scene: mi.Scene, objects: list[Geometry]) -> None:
     """Refuse sensors inside of objects, of any kind: they may have several places, or a surface.
-
-    Raises:
-        ValueError: rays of a sensor begin inside an object, whose id is named.
-    """
+    ValueError if rays of a sensor begin inside an object, whose id is named."""
     holders = InstanceTable.of([obj.shape for obj in objects], shown_groups(scene))
     for sensor in scene.sensors():
         for b, each in enumerate(objects):

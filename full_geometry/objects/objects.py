@@ -113,15 +113,8 @@ class Inclusions:
 
 def with_inclusions(scene: mi.Scene, objects: list[Geometry], mm_per_unit: float, what: str) -> list[Geometry]:
     """The objects of a scene that lie in no other, each with its `inclusions`.
-
-    Args:
-        scene, objects: as of `find_inclusions`.
-        mm_per_unit: length of a scene unit, mm.
-        what: sees neither lamps inside objects, nor what lies partly inside.
-
-    Raises:
-        ValueError: names such a thing and the object.
-    """
+    `scene`, `objects`: as of `find_inclusions`. `mm_per_unit`: length of a scene unit, mm. `what`: sees neither lamps
+    inside objects, nor what lies partly inside. ValueError names such a thing and the object."""
     result = find_inclusions(scene, objects)
     kinds = InstanceTable.of([obj.shape for obj in objects], shown_groups(scene)).kind
     for inclusion in result:
@@ -182,10 +175,7 @@ def places_of(scene: mi.Scene) -> list:
 
 def translucent_shapes(scene: mi.Scene) -> list[mi.Shape]:
     """The shapes whose surface is `translucent`: of the scene, and of the groups that instances in it show.
-
-    Raises:
-        ValueError: the scene has media of Mitsuba; or as of `wrapping_of`.
-    """
+    ValueError if the scene has media of Mitsuba; or as of `wrapping_of`."""
     shapes = shapes_of(scene, shown_groups(scene))
     _check_media(scene, shapes)
     return [shape for shape in shapes if surface_of(shape)]
@@ -261,9 +251,7 @@ class TranslucentObject:
 
     def at(self, transform: InstanceTransform | None) -> TranslucentObject:
         """The object as the instance that a ray has met; itself where it stands in the scene.
-
-        S of the half-space is asked for in the scene, that of a whole object in the frame of the group.
-        """
+        S of the half-space is asked for in the scene, that of a whole object in the frame of the group."""
         if not self.repeated:
             return self
         geometry, transport, proposals = self.geometry.as_instance(transform), self.transport, self.proposals
@@ -347,10 +335,7 @@ class TranslucentObject:
 
     def prepare_derivatives(self) -> None:
         """Make what derivatives by the medium need, before any loop is recorded.
-
-        Raises:
-            ValueError: they are asked for, and the model has none.
-        """
+        ValueError if they are asked for, and the model has none."""
         self.derivatives.prepare(self.transport)
         if self.geometry.inclusions is not None:
             self.geometry.inclusions.check_held()
@@ -375,9 +360,7 @@ class TranslucentObject:
 
 class KnowsUnit(abc.ABC):
     """An integrator that says how long a unit of its scene is: `bssrdf` and `translucent_walk`.
-
-    They register, as classes of Mitsuba take no second base.
-    """
+    They register, as classes of Mitsuba take no second base."""
 
     mm_per_unit: float
 
@@ -396,11 +379,7 @@ def millimetres(scene: mi.Scene) -> float:
 
 def check_size(geometry: Geometry, sigma_t: Sequence[float], mm_per_unit: float) -> None:
     """Warn of an object whose size in mean free paths speaks of another unit of length.
-
-    Args:
-        sigma_t: of each channel, 1/(scene unit).
-        mm_per_unit: length of a scene unit, mm.
-    """
+    `sigma_t`: of each channel, 1/(scene unit). `mm_per_unit`: length of a scene unit, mm."""
     size = geometry.size * (1 if geometry.group is None else geometry.group.scale)
     thickness = [size * value for value in sigma_t]
     thickness = [value for value in thickness if value * DIFFUSE_LIMIT * 1.001 < min(thickness)]  # which has no length
@@ -418,12 +397,8 @@ def check_size(geometry: Geometry, sigma_t: Sequence[float], mm_per_unit: float)
 
 class Expected(NamedTuple):
     """Means over channels.
-
-    Args:
-        single: reflectance of the half-space at normal incidence by single scattering.
-        multiple: by the orders from two on.
-        albedo: of single scattering, which nearly all leaves something thin.
-    """
+    `single`: reflectance of the half-space at normal incidence by single scattering. `multiple`: by the orders from two
+    on. `albedo`: of single scattering, which nearly all leaves something thin."""
 
     single: float
     multiple: float
@@ -530,10 +505,7 @@ def _check_inclusions(name: str, inclusions: Inclusions) -> None:
 
 def _object_of(scene: mi.Scene, name: str | None) -> mi.Shape:
     """The translucent shape called `name` in a scene, or the only one that lies in no other.
-
-    Raises:
-        ValueError: there is none, there are several and none is named, or it cannot be learnt.
-    """
+    ValueError if there is none, there are several and none is named, or it cannot be learnt."""
     known = {shape.id(): shape for shape in outermost(scene)}
     instances = [s.id() for s in scene.shapes() if is_instance(s)]
     if name in instances or (name is None and instances and not known):

@@ -123,10 +123,7 @@ class SmallEmitters:
     @classmethod
     def of(cls, scene: mi.Scene) -> SmallEmitters | None:
         """Find the small emitters of a scene; None if there are none.
-
-        Raises:
-            ValueError: as in `check_emitters`.
-        """
+        ValueError as in `check_emitters`."""
         check_emitters(scene)
         emitters = sorted((e for e in scene.emitters() if _has_place(e)), key=lambda e: not is_delta(e))
         sky = scene.environment()
@@ -259,10 +256,7 @@ def is_delta(emitter: mi.Emitter) -> bool:
 
 def check_emitters(scene: mi.Scene) -> None:
     """Refuse emitters that do not work, and warn of those that no path from a camera finds.
-
-    Raises:
-        ValueError: an emitter that Mitsuba's own path tracers cannot evaluate either, or light that is not finite.
-    """
+    ValueError for an emitter that Mitsuba's own path tracers cannot evaluate either, or light that is not finite."""
     for emitter in scene.emitters():
         _check_finite(emitter)
         kind = emitter.class_name()

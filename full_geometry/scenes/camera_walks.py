@@ -69,10 +69,7 @@ class CameraWalks:
 
     def exits(self, shape: mi.Shape, number: int, spp: int) -> list[FirstExits]:
         """First exits of the paths that meet an object first, from a pass of spp samples per pixel.
-
-        Args:
-            number: of the pass; `TRIAL` for one that is no part of the image.
-        """
+        `number`: of the pass; `TRIAL` for one that is no part of the image."""
         name, kept = shape.id(), []
         media = self.integrator.tracer(self.scene).visitor.media
         k = self._number(media, shape)

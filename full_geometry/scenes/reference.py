@@ -420,10 +420,7 @@ def chosen(scene: mi.Scene, integrator: mi.Integrator) -> dict[str, Any]:
 
 def _start(path: Path, resume: bool | str | os.PathLike, about: dict[str, Any]) -> Reference | None:
     """The render to go on with, if there is one.
-
-    Raises:
-        ValueError: it is damaged or of another render.
-    """
+    ValueError if it is damaged or of another render."""
     if resume is False or (resume is True and not path.exists()):
         return None
     path = path if resume is True else Path(resume)

@@ -68,9 +68,7 @@ class Reference:
     @property
     def relative_error(self) -> float:
         """sqrt(sum variance / sum mean²) over the colours of lit pixels (mean > 0), 0 if every pass was black.
-
-        Infinite before two passes.
-        """
+        Infinite before two passes."""
         lit = self.mean[..., :3] > 0
         if self.passes < 2:
             return math.inf
@@ -81,9 +79,7 @@ class Reference:
     @property
     def error(self) -> float:
         """`relative_error`, or with halves the most that the denoised image is off: its error and one standard error.
-
-        Infinite before that is known.
-        """
+        Infinite before that is known."""
         if self.half is None:
             return self.relative_error
         known = self.about.get(DENOISED)
@@ -92,10 +88,8 @@ class Reference:
     @property
     def share_by_chance(self) -> float | None:
         """Most of the variance that is light which orders below two meet by chance; None where it is not known.
-
-        At most: the square of its mean is not taken off, which is small where it makes much noise. Other filters than
-        a box, which share samples among pixels, make it larger, and so do samples of low discrepancy.
-        """
+        At most: the square of its mean is not taken off, which is small where it makes much noise. Other filters than a
+        box, which share samples among pixels, make it larger, and so do samples of low discrepancy."""
         whole = self.variance[..., :3].sum()
         if BY_CHANCE not in self.about or self.passes < 2:
             return None
@@ -103,10 +97,8 @@ class Reference:
 
     def add(self, image: np.ndarray, spp: int, seconds: float) -> Reference:
         """The average with one more pass of spp samples per pixel, rounded to what a file keeps.
-
-        Passes count by their samples n_k: mean m = sum n_k x_k / N, variance of the mean
-        sum n_k (x_k - m)² / ((K - 1) N), updated as by West (1979). A pass joins the half of fewer samples.
-        """
+        Passes count by their samples n_k: mean m = sum n_k x_k / N, variance of the mean sum n_k (x_k - m)² / ((K - 1)
+        N), updated as by West (1979). A pass joins the half of fewer samples."""
         n, passes = self.spp + spp, self.passes + 1
         delta = image.astype(np.float64) - self.mean
         mean = self.mean + delta * (spp / n)
@@ -176,10 +168,7 @@ def save(path: Path, reference: Reference) -> None:
 
 def load(path: str | os.PathLike) -> Reference:
     """Read the file of a reference.
-
-    Raises:
-        ValueError: there is no such file, or it is damaged or not one of these; the message names it.
-    """
+    ValueError if there is no such file, or it is damaged or not one of these; the message names it."""
     name = os.fspath(path)
     if not Path(name).is_file():
         raise ValueError(f"reference must be a file, got {name!r}")

@@ -102,9 +102,7 @@ def plainly(function: Callable) -> Callable:
 
 def _is_ours(error: BaseException) -> bool:
     """Whether a plugin of this project raised a ValueError: by the files of its traceback, or of that in the text.
-
-    A mesh without faces counts too: what Mitsuba says of it says nothing.
-    """
+    A mesh without faces counts too: what Mitsuba says of it says nothing."""
     error = _first(error)
     if isinstance(error, ValueError):
         return _is_refusal(error)
@@ -383,9 +381,7 @@ def _choose_integrator(
     state: ParserState, walks: bool, unnamed: bool, asked: tuple[bool, bool], settings: Mapping[str, float]
 ) -> None:
     """Make the integrator fit: whether a model, or anything, is asked for; one that is made gets the settings.
-
-    Where there is none, and no model is named either (`unnamed`), it is `translucent_walk`.
-    """
+    Where there is none, and no model is named either (`unnamed`), it is `translucent_walk`."""
     wanted, (model, anything) = _INTEGRATORS[walks], asked
     ours = [node.props for node in state.nodes if node.props.plugin_name() in _INTEGRATORS.values()]
     for props in ours if model else ():

@@ -41,11 +41,8 @@ LEAST_DECAY = 0.05  # of sigma_t', where nothing absorbs
 @dataclass(frozen=True, eq=False)
 class LayeredMedium(VaryingMedium):
     """Layers before the object is known that they are of; of its base class it is the first layer everywhere.
-
-    Args:
-        media: of the layers, with one value for each channel, 1/mm; of one g and eta.
-        thickness: of all layers but the last, mm.
-    """
+    `media`: of the layers, with one value for each channel, 1/mm; of one g and eta. `thickness`: of all layers but the
+    last, mm."""
 
     media: tuple[Medium, ...] = ()
     thickness: tuple[float, ...] = ()
@@ -64,11 +61,9 @@ class LayeredMedium(VaryingMedium):
         return cls(None, np.atleast_1d(first.sigma_t), None, np.atleast_1d(first.albedo), media, thickness)
 
     def mean(self) -> Medium:
-        """The homogeneous medium that stands for the layers where only one is taken.
-
-        sigma_s and sigma_a are means over the depth z with the weight exp(-2 ∫_0^z sigma_eff dz'), the square of how
-        much light of a diffuse field gets there: sigma_eff² = 3 sigma_a sigma_t', and at least a twentieth of sigma_t'.
-        """
+        """The homogeneous medium that stands for the layers where only one is taken. sigma_s and sigma_a are means over
+        the depth z with the weight exp(-2 ∫_0^z sigma_eff dz'), the square of how much light of a diffuse field gets
+        there: sigma_eff² = 3 sigma_a sigma_t', and at least a twentieth of sigma_t'."""
         rows = {key: np.array([np.atleast_1d(getattr(m, key)) for m in self.media]) for key in COEFFICIENTS}
         decay = np.sqrt(3 * rows["sigma_a"] * rows["sigma_t_prime"])
         decay = np.maximum(decay, LEAST_DECAY * rows["sigma_t_prime"])
@@ -106,10 +101,7 @@ COEFFICIENTS = ("sigma_s", "sigma_a", "sigma_t_prime")
 
 def read_layers(text: str) -> tuple[tuple[Medium, ...], tuple[float, ...]]:
     """Media and thicknesses (mm) of "NAME THICKNESS, ..., NAME", names of materials, or of "skin III" (I to VI).
-
-    Raises:
-        ValueError: no such material, or a thickness that is missing, no number or not above 0.
-    """
+    ValueError if there is no such material, or a thickness that is missing, no number or not above 0."""
     if text.startswith(SKIN) and "," not in text:
         kind = text.removeprefix(SKIN).strip()
         if kind not in MELANOSOMES:
@@ -159,10 +151,7 @@ _KNOWN: WeakKeyDictionary[Geometry, tuple[float, Depths]] = WeakKeyDictionary()
 
 def depths_of(obj: Geometry, deepest: float) -> Depths:
     """Depths of an object, correct up to `deepest` (scene units) and beyond it below that; made once.
-
-    Raises:
-        ValueError: the surface is not closed, or of unknown area.
-    """
+    ValueError if the surface is not closed, or of unknown area."""
     if obj in _KNOWN and _KNOWN[obj][0] >= deepest:
         return _KNOWN[obj][1]
     if not obj.closed:
@@ -203,12 +192,8 @@ def depths_of(obj: Geometry, deepest: float) -> Depths:
 @dataclass(frozen=True, eq=False)
 class LayerVolume:
     """A coefficient by layers, which is asked as a volume of Mitsuba.
-
-    Args:
-        depths: of the object.
-        below: depths at which the layers but the first begin, scene units.
-        values: (layers, channels).
-    """
+    `depths`: of the object. `below`: depths at which the layers but the first begin, scene units. `values`: (layers,
+    channels)."""
 
     depths: Depths
     below: tuple[float, ...]

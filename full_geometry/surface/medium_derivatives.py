@@ -35,19 +35,14 @@ class PerturbableTransport(Transport, Protocol):
 
     def perturbed(self, media: Sequence[Medium]) -> Transport:
         """The transport of the same object with a perturbed medium of each channel, 1/(scene unit).
-
-        On CUDA it takes no half precision.
-        """
+        On CUDA it takes no half precision."""
 
 
 @dataclass(frozen=True, eq=False)
 class Stencil:
     """Finite difference of ln S by one coefficient of the medium.
-
-    Args:
-        sides: transports of the perturbed media.
-        coefficients: of ln S of the transport itself and of both, by channel.
-    """
+    `sides`: transports of the perturbed media. `coefficients`: of ln S of the transport itself and of both, by
+    channel."""
 
     sides: list[Transport]
     coefficients: list[mi.Spectrum]
@@ -80,14 +75,8 @@ class MediumDerivatives:
 
     def prepare(self, transport: Transport | None) -> None:
         """Make the transports that the derivatives need, before any loop is recorded.
-
-        Args:
-            transport: of the object; None where no order from two on is asked for.
-
-        Raises:
-            ValueError: the model has no derivatives or takes no perturbed medium, or g of an object with textures is
-                followed.
-        """
+        `transport`: of the object; None where no order from two on is asked for. ValueError if the model has no
+        derivatives or takes no perturbed medium, or g of an object with textures is followed."""
         textured = self.spec.textured is not None  # which knows its derivatives but for g
         for name in VARIABLE if not textured else ("g",):
             with dr.resume_grad():
@@ -159,10 +148,7 @@ class MediumDerivatives:
 @dataclass(frozen=True, eq=False)
 class DifferentiableTransport(TransportAround):
     """A `PerturbableTransport` whose S has derivatives by the medium.
-
-    Args:
-        derivatives: of its object.
-    """
+    `derivatives`: of its object."""
 
     derivatives: MediumDerivatives
 

@@ -44,11 +44,8 @@ MIRRORED, STRAIGHT, REFLECTED, TRANSMITTED = range(4)
 
 class SlabTable:
     """M_r and M_t over albedo by azimuth and both internal cosines, and the scattered fluxes over albedo by one.
-
-    Args:
-        albedos: of single scattering, falling; one, or those even in s.
-        g, tau, eta: mean cosine, optical thickness and index.
-    """
+    `albedos`: of single scattering, falling; one, or those even in s. `g`, `tau`, `eta`: mean cosine, optical thickness
+    and index."""
 
     def __init__(self, albedos: np.ndarray, g: float, tau: float, eta: float) -> None:
         cosines, azimuths = np.linspace(math.sqrt(1 - 1 / eta**2), 1, COSINES), np.linspace(0, np.pi, AZIMUTHS)

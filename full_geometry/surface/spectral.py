@@ -33,12 +33,8 @@ Values = "mi.Spectrum | np.ndarray"
 @dataclass(frozen=True, eq=False)
 class MediumByWavelength:
     """The medium of an object at the wavelengths of rays.
-
-    Args:
-        spectra: the medium.
-        tables: sigma_t, sigma_s (1/mm) and g at every `STEP` from the first wavelength to the last, or at these two.
-        scale: factor of sigma_t and sigma_s.
-    """
+    `spectra`: the medium. `tables`: sigma_t, sigma_s (1/mm) and g at every `STEP` from the first wavelength to the
+    last, or at these two. `scale`: factor of sigma_t and sigma_s."""
 
     spectra: SpectralMedium
     tables: list[mi.Float]

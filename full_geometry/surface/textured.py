@@ -39,12 +39,7 @@ UNKNOWN = {"albedo": 0.5, "reflectance": 0.2, "sigma_t": 1.0, "mfp": 1.0}  # mea
 @dataclass(frozen=True, eq=False)
 class AlbedoTable:
     """The albedo a(R) of half-spaces of one index, from x of `physics.reflectance` over sqrt(R / most).
-
-    Args:
-        g: of each channel.
-        most: reflectance of albedo 1 of each channel; a(R) = 1 above it.
-        tables: by g.
-    """
+    `g`: of each channel. `most`: reflectance of albedo 1 of each channel; a(R) = 1 above it. `tables`: by g."""
 
     g: list[float]
     most: np.ndarray
@@ -204,11 +199,8 @@ class TexturedMedium:
 
     def mean(self, g: np.ndarray | float, eta: float, shape: mi.Shape | None = None) -> Medium:
         """The homogeneous medium with the means of albedo and extinction over texels, and over vertices of a mesh.
-
-        Args:
-            g, eta: mean cosine and relative index.
-            shape: whose attributes textures may show; without it `UNKNOWN` stands for them.
-        """
+        `g`, `eta`: mean cosine and relative index. `shape`: whose attributes textures may show; without it `UNKNOWN`
+        stands for them."""
         means = {name: _mean(name, texture, shape) for name, texture in self.textures.items()}
         albedo = means.get("albedo", self.albedo)
         if self.table is not None:
@@ -220,9 +212,7 @@ class TexturedMedium:
 
     def is_even(self, shape: mi.Shape) -> bool:
         """Whether its textures are the same everywhere on a shape, and no derivatives by them are followed.
-
-        Models are then those of the medium itself, which differ by 0.3 % between nodes of the albedo.
-        """
+        Models are then those of the medium itself, which differ by 0.3 % between nodes of the albedo."""
         values = [
             np.concatenate([texels(texture), attributes(name, texture, shape)])
             for name, texture in self.textures.items()
@@ -340,10 +330,7 @@ def linear_of_srgb(values: np.ndarray) -> np.ndarray:
 
 def attributes(name: str, texture: mi.Texture, shape: mi.Shape) -> np.ndarray:
     """The values of attributes of a mesh that a texture shows, shape (n, channels of the variant).
-
-    Raises:
-        ValueError: the shape has no such attribute, or one of another number of channels; `name` is the parameter's.
-    """
+    ValueError if the shape has no such attribute, or one of another number of channels; `name` is the parameter's."""
     values = []
     for node, key in shown(texture):
         if not (shape.is_mesh() and shape.has_attribute(key)):

@@ -168,10 +168,8 @@ def mean_of_grids(medium: VaryingMedium, g: np.ndarray | float, eta: float) -> M
 
 def equivalent(spec: Any, obj: Geometry) -> Any:
     """The spec with a homogeneous medium, which models of the half-space take.
-
     Its sigma_s and sigma_a are the means over the volume of the object, its albedo and sigma_t those over textures.
-    Layers have theirs already, see `layered.LayeredMedium.mean`.
-    """
+    Layers have theirs already, see `layered.LayeredMedium.mean`."""
     if spec.textured is not None:
         return replace(spec, medium=spec.textured.mean(spec.medium.g, spec.medium.eta, obj.shape))
     if spec.varying is None or spec.varying.by_depth:

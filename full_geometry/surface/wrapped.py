@@ -34,12 +34,8 @@ TRANSMITS = int(mi.BSDFFlags.Transmission) | int(mi.BSDFFlags.Null)
 
 class Mix(NamedTuple):
     """A mask or a blend.
-
-    Args:
-        weight: texture of the share of what is `second`, else of the first.
-        second: whether the translucent surface has that share.
-        other: what has the rest.
-    """
+    `weight`: texture of the share of what is `second`, else of the first. `second`: whether the translucent surface has
+    that share. `other`: what has the rest."""
 
     weight: mi.Texture
     second: bool
@@ -53,12 +49,8 @@ class Mix(NamedTuple):
 @dataclass(frozen=True, eq=False)
 class Wrapping:
     """A translucent surface with what is around it.
-
-    Args:
-        surface: the `translucent` BSDF.
-        bend: the normal or bump map around it, or None.
-        mixes: masks and blends, from the outermost.
-    """
+    `surface`: the `translucent` BSDF. `bend`: the normal or bump map around it, or None. `mixes`: masks and blends,
+    from the outermost."""
 
     surface: mi.BSDF
     bend: mi.BSDF | None = None
@@ -146,21 +138,15 @@ def wraps(bsdf: mi.BSDF) -> bool:
 
 def surface_of(shape: mi.Shape) -> mi.BSDF | None:
     """The `translucent` surface of a shape, whatever is around it; None where it has none.
-
-    Raises:
-        ValueError: as of `wrapping_of`.
-    """
+    ValueError as of `wrapping_of`."""
     wrapping = wrapping_of(shape)
     return None if wrapping is None else wrapping.surface
 
 
 def wrapping_of(shape: mi.Shape) -> Wrapping | None:
     """The `translucent` surface of a shape and what is around it; None where it has none.
-
-    Raises:
-        ValueError: something else than these BSDFs is around it, its other side is of another BSDF, a blend is with a
-            BSDF that lets light in or stands in a normal or bump map, or there are two of these.
-    """
+    ValueError if something else than these BSDFs is around it, its other side is of another BSDF, a blend is with a
+    BSDF that lets light in or stands in a normal or bump map, or there are two of these."""
     bsdf, bend, mixes = shape.bsdf(), None, []
     while not is_translucent(bsdf):
         if not _holds_one(bsdf):

@@ -52,9 +52,7 @@ DARK = "no light comes from it, every technique shows it black"
 @dataclass(frozen=True)
 class Option:
     """A way for a job: seconds and samples for each pixel, the error then, and one sentence that says why or why not.
-
-    A way that never keeps the tolerance has infinite seconds; `error` is then its bias.
-    """
+    A way that never keeps the tolerance has infinite seconds; `error` is then its bias."""
 
     way: str
     seconds: float

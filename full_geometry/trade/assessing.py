@@ -120,9 +120,7 @@ def assess_stage(
     tolerance: float | None = None,
 ) -> Assessment:  # fmt: skip
     """As `assess`, of a scene that is made ready, with the time shared by all techniques alike.
-
-    Denoised walks have the fewest samples that keep a tolerance, or the most that were measured.
-    """
+    Denoised walks have the fewest samples that keep a tolerance, or the most that were measured."""
     samples = SceneSamples.of(on, chosen, effort)
     budget = RunBudget(effort.seconds, effort.samples, effort.traced)
     samples.run([t for t in chosen if not t.denoised], budget, seeded(effort.seed, 42), progress)
@@ -135,10 +133,8 @@ def assess_for(
     every: bool = False,
 ) -> Assessment:  # fmt: skip
     """As `assess_stage`, with most of the time for techniques that could be the cheapest to keep a tolerance.
-
     Techniques that cannot be the cheapest for the job are left out by what few samples of others say; with `every` all
-    are measured. The time is that of all that is done, and points are fewer where walks are noisy.
-    """
+    are measured. The time is that of all that is done, and points are fewer where walks are noisy."""
     dear = DEAR if effort.seconds < DEAR_SECONDS else ()
     later = [t for t in chosen if not every and (t.gathers or t.model in dear)]
     ahead = [t for t in chosen if t not in later and not t.denoised]
@@ -214,10 +210,8 @@ def _go_on(
     progress: NamedProgress | None,
 ) -> None:  # fmt: skip
     """Run some techniques further, for the seconds that are left or until each bias² has the standard error `known`.
-
     With V t of a technique, the noise of all biases is least where its share of the time is sqrt(V t) over the sum of
-    these. Walks are compared with all n others, so that their V t counts n times.
-    """
+    these. Walks are compared with all n others, so that their V t counts n times."""
     parts, enough = dict.fromkeys(few, 0.0), dict.fromkeys(few, 0.0)
     for k, o in enumerate(assessed.objects):
         rows = {technique: o.way(technique.name) for technique in few} if o.ways else {}
@@ -265,10 +259,8 @@ def _denoise(
 
 def _not_denoised(name: str, best: str, cost: float, seconds: float, tolerance: float) -> str:
     """Why denoised walks are not worth a look for a job; empty where they are.
-
     In a time T the halves of n pixels that cost t a sample have V 2 n t / T of noise, which leaves their error² that
-    over sqrt(n).
-    """
+    over sqrt(n)."""
     if name != best:
         return f"not measured, as {best} has less noise in the same time"
     error2 = 2 * cost * math.sqrt(TILES * TILE**2) / seconds
@@ -416,10 +408,8 @@ def left_out(assessed: ObjectTrade, technique: Technique, job: Job, seconds: flo
 
 def most_promising(seen: Sequence[ObjectTrade], wanted: Sequence[Technique], job: Job) -> Technique:
     """The technique that is expected to end the job first.
-
     It keeps the tolerance by the chance that its model does, and takes what gathering takes then, else what the
-    cheapest of the other techniques does.
-    """
+    cheapest of the other techniques does."""
 
     def expected(technique: Technique) -> float:
         total = 0.0

@@ -132,12 +132,8 @@ def _way(model: str, light: str) -> Technique:
 
 class Pick(NamedTuple):
     """A model for an object.
-
-    Args:
-        seconds: of an image by it; infinite if it is not known to keep the tolerance.
-        sentence: why.
-        keeps: whether it is known to keep the tolerance.
-    """
+    `seconds`: of an image by it; infinite if it is not known to keep the tolerance. `sentence`: why. `keeps`: whether
+    it is known to keep the tolerance."""
 
     model: str
     seconds: float
@@ -188,9 +184,7 @@ def cost(assessed: ObjectTrade, row: TechniqueTrade, tolerance: float) -> float:
 
 class Decision(NamedTuple):
     """The way of all objects: that of walks, or None where models are chosen one by one; samples of a pixel, and why.
-
-    No samples are known where nothing is known to keep the tolerance.
-    """
+    No samples are known where nothing is known to keep the tolerance."""
 
     walks: Technique | None
     light: str
@@ -200,14 +194,8 @@ class Decision(NamedTuple):
 
 def decided(scene: mi.Scene, settings: Settings, ways: Sequence[str]) -> Decision:
     """The cheapest of some ways for one image, as `recommend` finds it.
-
-    Args:
-        settings: of the integrator; the tolerance is theirs.
-        ways: names of techniques.
-
-    Raises:
-        ValueError: the scene cannot be rendered, or the file of what was measured is damaged.
-    """
+    `settings`: of the integrator; the tolerance is theirs. `ways`: names of techniques. ValueError if the scene cannot
+    be rendered, or the file of what was measured is damaged."""
     return decision_of(advise(_measured(scene, settings, ways), Job(settings.tolerance)))
 
 

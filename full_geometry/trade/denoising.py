@@ -34,10 +34,8 @@ def cover(scene: mi.Scene, spp: int = GUIDE_SPP) -> np.ndarray:
 
 def guides(scene: mi.Scene, sensor: mi.Sensor | int = 0, spp: int = GUIDE_SPP) -> tuple[np.ndarray, np.ndarray]:
     """Mean albedo of each pixel (H, W, 3) and mean shading normal (H, W, 3), both float32.
-
     The albedo of translucent objects is their directional albedo. Where there is none at all, as of mirrors and glass,
-    it is the cover of the pixel, as Open Image Denoise asks.
-    """
+    it is the cover of the pixel, as Open Image Denoise asks."""
     return guides_of(_aovs(scene, GUIDES, spp, sensor))
 
 
@@ -60,15 +58,8 @@ def _cover(normal: np.ndarray) -> np.ndarray:
 
 def denoised(image: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, float]:
     """The image without its noise, float32, and the seconds it took.
-
-    Args:
-        image: linear radiance (H, W, 3).
-        albedo, normal: as `guides` makes them.
-
-    Raises:
-        ValueError: the image is not finite or below 0, or the sizes differ.
-        BackendError: the denoiser is not installed.
-    """
+    `image`: linear radiance (H, W, 3). `albedo`, `normal`: as `guides` makes them. ValueError if the image is not
+    finite or below 0, or the sizes differ. BackendError if the denoiser is not installed."""
     oidn, pixels = check_denoiser(), check_image("image", image)
     for name, guide in (("albedo", albedo), ("normal", normal)):
         if np.shape(guide) != pixels.shape:
@@ -81,15 +72,8 @@ def denoised(image: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> tuple
 
 class Denoiser:
     """A denoiser of renders of a scene, led by its albedo and normals.
-
-    Args:
-        sensor: of Mitsuba, or its number.
-        integrator: that renders; None for the one of the scene.
-        spp: samples of albedo and normals.
-
-    Raises:
-        BackendError: the denoiser is not installed.
-    """
+    `sensor`: of Mitsuba, or its number. `integrator`: that renders; None for the one of the scene. `spp`: samples of
+    albedo and normals. BackendError if the denoiser is not installed."""
 
     def __init__(
         self, scene: mi.Scene, sensor: mi.Sensor | int = 0, integrator: mi.Integrator | None = None,
@@ -101,11 +85,8 @@ class Denoiser:
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """The colours (H, W, 3) without noise; a layer of emission stays as it is: edges of lamps in mirrors are sharp.
-
-        Args:
-            image: linear radiance (H, W, channels), the last three the emission if the integrator has
-                that layer and there are more than three.
-        """
+        `image`: linear radiance (H, W, channels), the last three the emission if the integrator has that layer and
+        there are more than three."""
         # filters with negative lobes go below 0
         light = np.maximum(image[..., :3] if image.shape[2] >= 3 else image[..., :1].repeat(3, axis=2), 0.0)
         emission = np.clip(image[..., -3:], 0.0, light) if self._layered and image.shape[2] > 3 else 0.0

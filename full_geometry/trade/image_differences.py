@@ -16,14 +16,7 @@ LARGEST = 1e12  # radiance; squares of it, as tone mapping takes them, still fit
 
 def srgb(image: np.ndarray, exposure: float = 0.0) -> np.ndarray:
     """A linear image as a display shows it: times 2^exposure, clipped to [0, 1], encoded by the sRGB curve.
-
-    Args:
-        image: linear radiance, any shape, finite and >= 0.
-        exposure: stops.
-
-    Raises:
-        ValueError: exposure is not finite.
-    """
+    `image`: linear radiance, any shape, finite and >= 0. `exposure`: stops. ValueError if exposure is not finite."""
     check_finite("exposure", exposure)
     x = np.clip(np.asarray(image, dtype=np.float32) * np.float32(2.0**exposure), 0.0, 1.0)
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055).astype(np.float32)
@@ -36,10 +29,7 @@ def luminance(image: np.ndarray) -> np.ndarray:
 
 def check_image(name: str, image: np.ndarray, largest: float = LARGEST) -> np.ndarray:
     """The image as contiguous float32 of shape (H, W, 3).
-
-    Raises:
-        ValueError: the shape is another, a value is not finite, below 0 or above `largest`.
-    """
+    ValueError if the shape is another, a value is not finite, below 0 or above `largest`."""
     try:
         pixels = np.asarray(image, dtype=np.float64)
     except (TypeError, ValueError) as error:

@@ -32,11 +32,7 @@ def small_images(
     on: Stage, chosen: Sequence[Technique], sensor: int, seed: int, side: int = SIDE, spp: int = SPP
 ) -> dict[str, np.ndarray]:
     """Linear images (H, W, 3) of the ways that do not refuse the scene, by name; one seed for all.
-
-    Args:
-        chosen: ways.
-        side: longest side, pixels.
-    """
+    `chosen`: ways. `side`: longest side, pixels."""
     camera = on.scene.sensors()[sensor]
     film = camera.film()
     small = _film(np.array(film.crop_size(), dtype=int), side)
@@ -124,14 +120,9 @@ class DenoisingBudget(NamedTuple):
 def denoised_rows(
     on: Stage, technique: Technique, found: Sequence[tuple[float, TechniqueTrade] | None], budget: DenoisingBudget
 ) -> list[TechniqueTrade | None]:
-    """What denoised walks are worth on each object.
-
-    The row of an object is of the fewest samples of a pixel that keep the tolerance, of the most if none does.
-
-    Args:
-        technique: denoised walks.
-        found: mean radiance of each object, and the row of the same walks as they are; None where it is not seen.
-    """
+    """What denoised walks are worth on each object. The row of an object is of the fewest samples of a pixel that keep
+    the tolerance, of the most if none does. `technique`: denoised walks. `found`: mean radiance of each object, and the
+    row of the same walks as they are; None where it is not seen."""
     # ---- tiles of the image, with guides and covers of objects
     camera, tolerance = on.scene.sensors()[budget.sensor], budget.tolerance or 0.0
     film = tuple(int(n) for n in camera.film().crop_size())
@@ -269,11 +260,8 @@ def with_flip(
     spp: int = SPP,
 ) -> Assessment:
     """The assessment with FLIP of the whole small image, where the evaluator is installed and something shines.
-
-    Args:
-        chosen: ways, path traced first.
-        images: of `small_images`, if they have been rendered, with `spp` samples a pixel.
-    """
+    `chosen`: ways, path traced first. `images`: of `small_images`, if they have been rendered, with `spp` samples a
+    pixel."""
     if find_spec("flip_evaluator") is None or all(o.is_dark for o in assessment.objects):
         return assessment
     measured = {PATH_TRACED, *(w.way for o in assessment.objects for w in o.ways if not w.refusal)}

@@ -65,12 +65,8 @@ Samples = dict[Technique, "list[Sampled] | str"]  # of an object by each techniq
 
 class RunBudget(NamedTuple):
     """The time or samples that a run of several techniques may take.
-
-    Args:
-        seconds: for each object; with 0 the first samples are all.
-        samples: of each exit, instead.
-        traced: share of the walks.
-    """
+    `seconds`: for each object; with 0 the first samples are all. `samples`: of each exit, instead. `traced`: share of
+    the walks."""
 
     seconds: float = 0.0
     samples: int | None = None
@@ -166,10 +162,8 @@ class SceneSamples:
 
     def keep(self, walked: Assessment) -> None:
         """Keep fewer points where walks are noisy or slow.
-
         For a bias² b², n points leave errors of about b² sqrt(2 / n) by their choice and V t sqrt(2 n) / time by noise,
-        which are equal for n = time b² / (V t).
-        """
+        which are equal for n = time b² / (V t)."""
         for k, o in enumerate(walked.objects):
             noise = self.noise(k, self.reference(k)).value if o.ways else 0.0
             if noise > 0:

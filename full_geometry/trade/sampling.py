@@ -74,10 +74,7 @@ def first_sample(
     stage: Stage, technique: Technique, exits: Exits, seed: int, each: int = PILOT, object: int = 0
 ) -> Sampled:
     """Make a way ready and take few samples, which compiles its kernels; nothing if an earlier look knows its pace.
-
-    Raises:
-        ValueError: the way refuses the scene.
-    """
+    ValueError if the way refuses the scene."""
     if (object, technique) in stage.paces:
         estimate = RadianceEstimate(variant_channels(), exits.n)
         return replace(stage.paces[object, technique], estimate=estimate, preparing=0.0, compilation=0.0, compiling=0.0)
@@ -164,11 +161,7 @@ def sample_more(
     samples: int | None = None,
 ) -> None:
     """Sample further, for so many seconds or a number of samples of each exit.
-
-    Args:
-        sampled: what is there already.
-        samples: of each exit, instead; the outcome then depends on the seed alone.
-    """
+    `sampled`: what is there already. `samples`: of each exit, instead; the outcome then depends on the seed alone."""
     most, started = max(LANES // exits.n, 2), clock()
     while True:
         if samples:
@@ -189,12 +182,7 @@ def sample_more(
 
 def sample_blur(stage: Stage, exits: Exits, seed: int, samples: int) -> RadianceEstimate:
     """Light of delta lights that walks find by no strategy, but spread over a cone, see `objects.small_emitters`.
-
-    Those are the same paths with and without it, the cone so wide that few samples tell.
-
-    Args:
-        samples: of each exit.
-    """
+    Those are the same paths with and without it, the cone so wide that few samples tell. `samples`: of each exit."""
     techniques = [Technique(PATH_TRACED, blur=blur) for blur in (0.0, BLUR)]
     estimate, most = RadianceEstimate(variant_channels(), exits.n), max(LANES // exits.n, 2)
     while (each := min(samples - estimate.samples, most)) > 0:
@@ -246,12 +234,8 @@ def _sums(L: list[mi.Float], each: int) -> tuple[np.ndarray, np.ndarray]:
 
 def radiance(scene: mi.Scene, integrator: mi.Integrator, sampler: mi.Sampler, ray: mi.Ray3f) -> list[mi.Float]:
     """Radiance of rays, by channel, by one kernel for all that it is asked for.
-
     It is evaluated at once, as sums evaluate what they are given and would trace all paths for each channel anew.
-
-    Args:
-        sampler: of a number for each ray at a time.
-    """
+    `sampler`: of a number for each ray at a time."""
     L = _recorded(scene, integrator, sampler, ray)
     dr.eval(L)
     return L
@@ -281,12 +265,8 @@ CHAIN = 4  # boundaries that light of a lamp may meet without scattering, mirror
 @dataclass(frozen=True, eq=False)
 class Exits:
     """Rays of the camera that meet an object first.
-
-    Args:
-        o, d: origins and directions, float32 (3, n).
-        share: of the image that the object fills.
-        pixels: of the film that it fills.
-    """
+    `o`, `d`: origins and directions, float32 (3, n). `share`: of the image that the object fills. `pixels`: of the film
+    that it fills."""
 
     o: np.ndarray
     d: np.ndarray
@@ -313,10 +293,7 @@ class Exits:
 
 def visible_exits(scene: mi.Scene, shapes: list[mi.Shape], sensor: int, n: int, seed: int) -> list[Exits | None]:
     """Find n rays of a sensor that meet each shape first; fewer where it is hardly seen, None where it is not.
-
-    Args:
-        n: rays of each.
-    """
+    `n`: rays of each."""
     camera = scene.sensors()[sensor]
     pixels = int(np.prod(np.array(camera.film().crop_size())))
     results: list[list[np.ndarray]] = [[] for _ in shapes]

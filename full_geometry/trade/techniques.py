@@ -63,9 +63,7 @@ class Technique:
     @property
     def halves(self) -> tuple[Technique, ...]:
         """The techniques that it is measured by: itself, or two independent parts of gathered or precomputed light.
-
-        Corrected light is measured as images have it, so that the noise of its walks counts.
-        """
+        Corrected light is measured as images have it, so that the noise of its walks counts."""
         return (self,) if self.light in ("sampled", CORRECTED) else (replace(self, part=1), replace(self, part=2))
 
     @property
@@ -108,12 +106,8 @@ def techniques() -> list[Technique]:
 @dataclass(eq=False)
 class Stage:
     """A loaded scene, and the integrators of several techniques for it.
-
-    Args:
-        settings: of its integrator, by parameter name.
-        bssrdf: parameters that `bssrdf` alone understands.
-        paces: first `Sampled` of earlier runs by (object, technique), so that the next run knows what a sample takes.
-    """
+    `settings`: of its integrator, by parameter name. `bssrdf`: parameters that `bssrdf` alone understands. `paces`:
+    first `Sampled` of earlier runs by (object, technique), so that the next run knows what a sample takes."""
 
     scene: mi.Scene
     shapes: list[mi.Shape]
@@ -162,14 +156,8 @@ class Stage:
 
 def stage(scene: mi.Scene | dict[str, Any] | str | Path, parameters: dict[str, str] | None = None) -> Stage:
     """A scene made ready to be rendered by several techniques.
-
-    Args:
-        scene: a Mitsuba scene, a dict, or the path of an XML file.
-        parameters: values of the parameters $name of an XML file.
-
-    Raises:
-        ValueError: as `load_objects`; there is no translucent object or no sensor, or it is an instance.
-    """
+    `scene`: a Mitsuba scene, a dict, or the path of an XML file. `parameters`: values of the parameters $name of an XML
+    file. ValueError as of `load_objects`, or if there is no translucent object or no sensor, or it is an instance."""
     check_variant()
     loaded = scene if isinstance(scene, mi.Scene) else load_objects(scene, parameters)
     shapes = translucent_shapes(loaded)
@@ -202,12 +190,8 @@ TRACED_SHARE = 0.4  # of the time, for the walks that all techniques are compare
 @dataclass(frozen=True)
 class Job:
     """A job of rendering.
-
-    Args:
-        tolerance: relative error of radiance, bias and noise together.
-        images: of the object, each as large as the film.
-        seconds: that all of them may take; None for no limit.
-    """
+    `tolerance`: relative error of radiance, bias and noise together. `images`: of the object, each as large as the
+    film. `seconds`: that all of them may take; None for no limit."""
 
     tolerance: float = 0.05
     images: int = 1

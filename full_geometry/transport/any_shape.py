@@ -89,11 +89,7 @@ LEAST_S = 1e-30
 
 class Backbone(HalfSpace):
     """S_0 P_o P_i per channel.
-
-    Args:
-        mixtures: what each of its channels mixes.
-        precise: as of `HalfSpace`.
-    """
+    `mixtures`: what each of its channels mixes. `precise`: as of `HalfSpace`."""
 
     def __init__(self, obj: TranslucentObject, mixtures: Sequence[Mixed], precise: bool = False) -> None:
         super().__init__(obj, MODEL, FLOOR, precise)
@@ -218,11 +214,7 @@ class NeuralShape(Transport):
 
     def S(self, exit: End, at: SurfacePoint, active: mi.Bool = True) -> mi.Spectrum:
         """S(x_i, w_i; x_o, w_o) per channel, 1/((scene unit)² sr); 0 below the horizons.
-
-        Args:
-            exit: from `prepare`.
-            at: entry, with w_i.
-        """
+        `exit`: from `prepare`. `at`: entry, with w_i."""
         return self(exit, self.end(at, active), active)
 
     def __call__(self, exit: End, entry: End, active: mi.Bool = True) -> mi.Spectrum:
@@ -245,9 +237,7 @@ class NeuralShape(Transport):
 
 def most(lib: ModuleType, g: Lanes) -> Lanes:
     """The bound of f above: 3 for g <= 0, falling to 1.5 at g = 0.5.
-
-    Light that is scattered forwards comes from few pairs, which too large an f makes far too bright in what is thin.
-    """
+    Light that is scattered forwards comes from few pairs, which too large an f makes far too bright in what is thin."""
     return MOST - (MOST - MOST_FORWARD) * lib.clip(g / FORWARD, 0, 1)
 
 
@@ -271,10 +261,7 @@ MOST_SCALE = 4.0
 
 def calibrated(model: NeuralShape) -> NeuralShape:
     """The same S with such scales that as much light leaves as by walks; of what is flat or does not scatter as it is.
-
-    Args:
-        model: of an object, any weights.
-    """
+    `model`: of an object, any weights."""
     weights = np.array([calibration_weight(mixture) for mixture in model.half_space.mixtures])
     if not weights.any():
         return model
@@ -289,12 +276,8 @@ def calibrated(model: NeuralShape) -> NeuralShape:
 @dataclass(frozen=True, eq=False)
 class HeldLight:
     """How B and <S> of a model change with its medium: B by the scores of walks, <S> by the same pairs.
-
-    Args:
-        model: calibrated.
-        scores: d ln B by sigma_s, sigma_t (scene units) and g, (3, channels).
-        exits, entries, over: pairs, as of `_drawn`.
-    """
+    `model`: calibrated. `scores`: d ln B by sigma_s, sigma_t (scene units) and g, (3, channels). `exits`, `entries`,
+    `over`: pairs, as of `_drawn`."""
 
     model: NeuralShape
     scores: np.ndarray
@@ -396,10 +379,7 @@ def shipped_weights() -> Path:
 @once
 def load(path: Path) -> dict[str, np.ndarray]:
     """The arrays of a file of weights.
-
-    Raises:
-        ValueError: it is damaged, of another kind, or of a network of other descriptors; the message names the file.
-    """
+    ValueError if it is damaged, of another kind, or of a network of other descriptors; the message names the file."""
     arrays, _ = load_weights(path, KIND)
     depth, inputs = len(arrays) // 2, N_OWN + N_SHARED + N_MEDIUM
     outputs = len(range(N_OWN)[CURVED_OWN]) + len(range(N_SHARED)[CURVED_SHARED])
@@ -423,10 +403,7 @@ def checksums(obj: TranslucentObject, path: str | os.PathLike | None = None) -> 
 
 def transport(obj: TranslucentObject, path: str | os.PathLike | None = None) -> NeuralShape:
     """The model of an object, by the shipped weights or others, held to the light that leaves by walks.
-
-    Raises:
-        ValueError: the file cannot be used, or the medium varies or is out of the range of `neural`.
-    """
+    ValueError if the file cannot be used, or the medium varies or is out of the range of `neural`."""
     if obj.varying is not None:
         name = obj.geometry.shape.id()
         raise ValueError(f"the medium of {name!r} must be the same everywhere for {KIND}, got one that varies")
@@ -463,9 +440,7 @@ def warn_out_of_range(geometry: Geometry, media: tuple[Medium, ...]) -> None:
 
 def warn_of_clear(obj: TranslucentObject) -> None:
     """Warn, by name and number, of an object so clear that the calibration by its mean light does not hold it.
-
-    A ball of grapefruit juice with a mean chord of 2.6 is 13 % too bright under a lamp, with 5.2 it is 4 %.
-    """
+    A ball of grapefruit juice with a mean chord of 2.6 is 13 % too bright under a lamp, with 5.2 it is 4 %."""
     chord = max(mean_chord(obj), 0.0)
     clear = [c for m in obj.media if 0 < (c := chord * float(m.sigma_t_prime)) < CLEAR]
     if clear:
@@ -479,10 +454,7 @@ def warn_of_clear(obj: TranslucentObject) -> None:
 
 def shape_model(obj: TranslucentObject, settings: Settings) -> ObjectModel:
     """Transport and proposals of any object with a homogeneous medium and a smooth boundary.
-
-    Raises:
-        ValueError: the medium varies or is out of the range of `neural`, or normals of pieces of the object disagree.
-    """
+    ValueError if the medium varies or is out of the range of `neural`, or normals of pieces of the object disagree."""
     geometry = obj.geometry
     check_geometry(geometry)
     warn_out_of_range(geometry, obj.media)

@@ -130,9 +130,7 @@ def on_a_plane(
     n_o: mi.Normal3f, inner_o: mi.Vector3f, n_i: mi.Normal3f, inner_i: mi.Vector3f, line: Segment
 ) -> tuple[mi.Vector3f, mi.Vector3f]:
     """The refracted directions as on a plane, x along the line between the points, z along the normals.
-
-    There both y lie a mean free path along them.
-    """
+    There both y lie a mean free path along them."""
 
     def inside(n: mi.Normal3f, along: mi.Vector3f) -> mi.Vector3f:
         flat = mi.Vector3f(line.d - n * dr.dot(n, line.d))
@@ -190,11 +188,7 @@ def directions(n: int = RAYS) -> np.ndarray:
 
 def look(obj: TranslucentObject, at: SurfacePoint, event: FirstEvent, active: mi.Bool = True) -> list[RaySurroundings]:
     """Surroundings of the first events of each channel; channels of the same extinction share them.
-
-    Args:
-        at: points of its surface, with the directions outside that light goes along.
-        event: their first events.
-    """
+    `at`: points of its surface, with the directions outside that light goes along. `event`: their first events."""
     known: dict[tuple[float, float], RaySurroundings] = {}
     for m, y in zip(obj.media, event.ys):
         key = float(m.sigma_t), float(m.sigma_t_prime)

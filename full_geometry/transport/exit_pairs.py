@@ -55,16 +55,9 @@ def trace_exits(
     fewest: int = 2,
     most: int = 2**31 - 1,
 ) -> WalkExits:
-    """One walk from each start.
-
-    Args:
-        starts: where light is seen to leave, and the direction towards the eye.
-        seed: of the pass, as for `walk.pass_seed`.
-        fewest, most: numbers of scattering events that are kept.
-
-    Raises:
-        ValueError: fewest is not a whole number >= 0.
-    """
+    """One walk from each start. `starts`: where light is seen to leave, and the direction towards the eye. `seed`: of
+    the pass, as for `walk.pass_seed`. `fewest`, `most`: numbers of scattering events that are kept. ValueError if
+    fewest is not a whole number >= 0."""
     check_count("fewest", fewest, 0)
     return exits(media_within(obj), 0, starts, seed, fewest, most)
 
@@ -188,12 +181,8 @@ class EntryProposals:
 @dataclass(frozen=True, eq=False)
 class PairSource:
     """Makes training data.
-
-    Args:
-        base: base model S_0, which values of proposals have.
-        proposals: where they come from.
-        scale: of T of each channel, one over its mean; without it every walk that left is kept.
-    """
+    `base`: base model S_0, which values of proposals have. `proposals`: where they come from. `scale`: of T of each
+    channel, one over its mean; without it every walk that left is kept."""
 
     object: TranslucentObject
     frame: ObjectFrame
@@ -249,11 +238,7 @@ class PairSource:
 
     def proposed(self, n: int, seed: tuple[int, ...], starts: SurfacePoint | None = None) -> Pairs:
         """n proposals, S mu_i of the base model over their density as values.
-
-        Args:
-            n: how many.
-            starts: n exits that they are of; by default random ones.
-        """
+        `n`: how many. `starts`: n exits that they are of; by default random ones."""
         rng = generator(mi, n, pass_seed(*seed, 2))
         starts = starts or self.object.random_points(rng)
         entries, weight = self.proposals.sample(starts, rng)

@@ -53,10 +53,8 @@ CELLS, FIRST_CELL = 12, 0.25  # of a march; the first one in mean free paths
 
 class FirstEvent(NamedTuple):
     """P per channel; y and the mean length of the way there, means over channels weighted by P; both per channel.
-
     Also `local`: of a medium that varies logarithms of its coefficients where light enters and at y, of one with
-    textures those of the exit.
-    """
+    textures those of the exit."""
 
     P: mi.Spectrum
     y: mi.Point3f
@@ -70,9 +68,7 @@ def flight(
     obj: TranslucentObject, o: mi.Point3f, d: mi.Vector3f, length: mi.Float, sigma_t: mi.Spectrum
 ) -> tuple[mi.Spectrum, mi.Spectrum]:
     """exp(-∫ sigma_t) over a length from o along d, and ∫ s sigma_t exp(-∫ sigma_t) ds, per channel.
-
-    A medium that varies is marched in cells that grow from a part of a mean free path on, each homogeneous.
-    """
+    A medium that varies is marched in cells that grow from a part of a mean free path on, each homogeneous."""
 
     def add(
         sigma_t: mi.Spectrum, T: mi.Spectrum, inner: mi.Spectrum, s: mi.Float, h: mi.Float
@@ -207,13 +203,9 @@ RAYS = ((0.013, 0.027, 1.0), (1.0, 0.021, -0.017), (-0.015, -1.0, 0.031))  # alo
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """The fields of one object.
-
-    Args:
-        textures: their values, turned for points and for first events.
-        low, scale: of a position in the frame, that turn it into one of a texture: (q - low) scale.
-        turns: (2, fields, fields + 1), C^(-1/2) and -C^(-1/2) of the mean for points and for first events.
-    """
+    """The fields of one object. `textures`: their values, turned for points and for first events. `low`, `scale`: of a
+    position in the frame, that turn it into one of a texture: (q - low) scale. `turns`: (2, fields, fields + 1),
+    C^(-1/2) and -C^(-1/2) of the mean for points and for first events."""
 
     textures: tuple[mi.Texture3f, mi.Texture3f]
     low: mi.Point3f
@@ -227,11 +219,7 @@ class Surroundings:
 
 def surroundings(obj: TranslucentObject, frame: ObjectFrame, turns: np.ndarray | None = None) -> Surroundings:
     """The fields of an object.
-
-    Args:
-        frame: a `ObjectFrame` of its features.
-        turns: those of training; by default made from random points.
-    """
+    `frame`: a `ObjectFrame` of its features. `turns`: those of training; by default made from random points."""
     low, high = _bounds(obj, frame)
     longest = float((high - low).max())
     low, high = low - MARGIN * longest, high + MARGIN * longest
@@ -363,11 +351,8 @@ def n_pair(channels: int) -> int:
 
 class Terms(NamedTuple):
     """Products of two of (1, features of a side): all features, and those of two that are no octaves.
-
-    Attributes:
-        heads: places of the first factors among (1, features), no octaves.
-        rows, cols: of each product the first factor among the heads, and the second among (1, features).
-    """
+    `heads`: places of the first factors among (1, features), no octaves. `rows`, `cols`: of each product the first
+    factor among the heads, and the second among (1, features)."""
 
     heads: np.ndarray
     rows: np.ndarray
@@ -390,11 +375,7 @@ class Terms(NamedTuple):
 
 class Quadratic:
     """h = l . x + x_h . Q x_h of an end, x = (1, features), x_h those of them that are no octaves.
-
-    Args:
-        numbers: (outputs, products) of `Terms`.
-        n: features of a side.
-    """
+    `numbers`: (outputs, products) of `Terms`. `n`: features of a side."""
 
     def __init__(self, numbers: np.ndarray, n: int) -> None:
         terms = Terms.of(n)
@@ -434,11 +415,7 @@ def side_features(frame: ObjectFrame, side: Side) -> list[mi.Float]:
 
 def entering(columns: Sequence[Lanes], eta: Lanes | float, channels: int) -> tuple[list[Lanes], list[Lanes]]:
     """F_t(mu), and F_t(mu) P, per channel: the shares of light along w that enter, and are scattered or absorbed.
-
-    Args:
-        columns: features of a side, of NumPy, torch or Dr.Jit.
-        eta: relative index.
-    """
+    `columns`: features of a side, of NumPy, torch or Dr.Jit. `eta`: relative index."""
     lib, mu = library(columns[MU]), columns[MU]
     F_t = fresnel.F_t(lib.maximum(mu, 0 * mu), eta)
     P = [lib.exp(2 * columns[P_0 + c]) - LEAST_P for c in range(channels)]
@@ -495,10 +472,7 @@ def reverse(n: int, channels: int) -> tuple[np.ndarray, np.ndarray]:
 
 class BaseModel(Protocol):
     """What the network of one object begins with and multiplies: `HalfSpace`, or the network of all shapes.
-
-    Attributes:
-        models: half-space model of each channel, whose radial densities probes follow.
-    """
+    `models`: half-space model of each channel, whose radial densities probes follow."""
 
     @property
     def models(self) -> Sequence[BSSRDF]: ...

@@ -39,12 +39,8 @@ POINTS_PER_RATIO, MOST_POINTS = 60.0, 9  # candidates over the area
 @dataclass(frozen=True, eq=False)
 class HalfSpaceTransport(Transport):
     """S of the half-space at the distance of two surface points, see `plane_query`.
-
-    Args:
-        models: one per channel, in scene units.
-        geometry: "distance" or "tangent", see `points.separation`.
-        precise: asked `in_double`, for differences.
-    """
+    `models`: one per channel, in scene units. `geometry`: "distance" or "tangent", see `points.separation`. `precise`:
+    asked `in_double`, for differences."""
 
     models: list[BSSRDF]
     geometry: str = "distance"
@@ -82,11 +78,8 @@ def in_double(query: tuple) -> tuple:
 @dataclass(frozen=True, eq=False)
 class HalfSpaceProposals(Proposals):
     """Points by probes and over the area, directions by a model.
-
-    Args:
-        model: whose directions of incidence are drawn.
-        textured: a medium that entries are to know, 1/(scene unit), or None.
-    """
+    `model`: whose directions of incidence are drawn. `textured`: a medium that entries are to know, 1/(scene unit), or
+    None."""
 
     positions: PositionSampler
     model: BSSRDF
@@ -116,11 +109,7 @@ class HalfSpaceProposals(Proposals):
 
 def half_space_model(name: str, geometry: Geometry, media: Sequence[Medium], settings: Settings) -> ObjectModel:
     """The transport and the proposals of a half-space model on an object.
-
-    Args:
-        media: of each channel, 1/(scene unit).
-        settings: geometry and share of uniform entries.
-    """
+    `media`: of each channel, 1/(scene unit). `settings`: geometry and share of uniform entries."""
     models = [bssrdf(name, m) for m in media]
     table = radial_table([model for model, m in zip(models, media) if float(m.sigma_s) > 0], name, geometry)
     share = area_share(geometry, table.mean / geometry.size, settings.area_share)
@@ -137,11 +126,9 @@ def radial_table(models: list[BSSRDF], name: str, geometry: Geometry) -> RadialT
 
 
 def area_share(geometry: Geometry, ratio: float, wanted: float) -> float:
-    """Share of candidates over the area, by default for a ratio of mean distance to object size.
-
-    On a dragon of ratio 0.16 nine such points beside a probe bring variance x time to a third of that without, 15 do
-    the same; at 0.05 (bunny) and 0.04 (candle) the first ones cut the tail at equal cost, kurtosis 18 to 7 and 15 to 5.
-    """
+    """Share of candidates over the area, by default for a ratio of mean distance to object size. On a dragon of ratio
+    0.16 nine such points beside a probe bring variance x time to a third of that without, 15 do the same; at 0.05
+    (bunny) and 0.04 (candle) the first ones cut the tail at equal cost, kurtosis 18 to 7 and 15 to 5."""
     if geometry.area > 0:
         m = int(np.clip(round(POINTS_PER_RATIO * ratio), 1, MOST_POINTS))
         return wanted if wanted != AUTOMATIC else m / (1 + m)
@@ -163,10 +150,7 @@ LINES = 2**14
 
 def check_turns(geometry: Geometry, media: Sequence[Medium], model: str) -> None:
     """ValueError if more than `MOST_STRAIGHT` of the light passes straight through an object, which `model` lacks.
-
-    Args:
-        media: of each channel, 1/(scene unit).
-    """
+    `media`: of each channel, 1/(scene unit)."""
     share = float(straight_share(geometry, media).max())
     if share > MOST_STRAIGHT:
         raise ValueError(

@@ -22,10 +22,7 @@ NODES = 1025  # of the table of R by x
 @dataclass(frozen=True, eq=False)
 class LambertTransport(Transport):
     """S = R delta(x_i - x_o) / pi, R the exact reflectance of the half-space under light from everywhere.
-
-    Args:
-        reflectance: R of each channel at an exit.
-    """
+    `reflectance`: R of each channel at an exit."""
 
     reflectance: Callable[[SurfacePoint], list[mi.Float]]
     orders = "total"
@@ -40,10 +37,7 @@ class LambertTransport(Transport):
 
 class ReflectanceTable:
     """R of the medium at an exit whose object has textures, by a table of ln(R / albedo) over x.
-
-    Args:
-        media: of each channel; their g and eta hold.
-    """
+    `media`: of each channel; their g and eta hold."""
 
     def __init__(self, media: Sequence[Medium]) -> None:
         self.g, self.tables = [m.g for m in media], {}

@@ -116,11 +116,8 @@ class HalfSpace:
 @dataclass(frozen=True, eq=False)
 class DirectionalAlbedo:
     """The directional albedo of one object.
-
-    Args:
-        weights: A_k (outputs, inputs) and a_k of the layers.
-        trusted: (2, channels) from `learning.training.trusted`.
-    """
+    `weights`: A_k (outputs, inputs) and a_k of the layers. `trusted`: (2, channels) from
+    `learning.training.trusted`."""
 
     object: TranslucentObject
     frame: ObjectFrame
@@ -204,11 +201,7 @@ class FullGeometry(Transport):
 
     def S(self, exit: PreparedExit, at: SurfacePoint, active: mi.Bool = True) -> mi.Spectrum:
         """S(x_i, w_i; x_o, w_o) per channel, 1/((scene unit)² sr); 0 below the horizons.
-
-        Args:
-            exit: from `prepare`.
-            at: entry, with w_i.
-        """
+        `exit`: from `prepare`. `at`: entry, with w_i."""
         entry, net = self.base.end(entered(at, exit.side.at), active), self._network
         features, h = self._end(entry)
         features += pair_features(self.frame, exit.side, entry)

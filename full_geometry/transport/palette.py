@@ -97,12 +97,8 @@ class Slope:
 @dataclass(frozen=True, eq=False)
 class Distances:
     """Distances at which functions are asked, and those for which they are interpolated, in mean free paths.
-
-    Args:
-        every: for which they are wanted.
-        r: at which they are asked: these, or places of Chebyshev in the logarithm over their range.
-        middle, half: of that range of the logarithm; none where they are asked at all.
-    """
+    `every`: for which they are wanted. `r`: at which they are asked: these, or places of Chebyshev in the logarithm
+    over their range. `middle`, `half`: of that range of the logarithm; none where they are asked at all."""
 
     every: list[mi.Float]
     r: list[mi.Float]
@@ -156,15 +152,8 @@ class Palette:
     @classmethod
     def of(cls, name: str, albedos: np.ndarray, extinctions: np.ndarray, media: Sequence[Medium]) -> Palette:
         """The palette of a model.
-
-        Args:
-            albedos: that nodes have to cover, shape (n, channels).
-            extinctions: of all places, shape (n, channels).
-            media: of each channel; their g and eta hold.
-
-        Raises:
-            ValueError: the model knows some media only.
-        """
+        `albedos`: that nodes have to cover, shape (n, channels). `extinctions`: of all places, shape (n, channels).
+        `media`: of each channel; their g and eta hold. ValueError if the model knows some media only."""
         refusal = ""  # raised outside of the handler: messages of Mitsuba's functions are those of first causes
         try:
             model = bssrdf(name, Medium.from_albedo(0.5, 1.0, media[0].g, media[0].eta))
@@ -203,9 +192,7 @@ class Palette:
 
     def S(self, ends: Sequence[MediumAt], query: tuple[mi.Float, ...], active: mi.Bool) -> mi.Spectrum:
         """sqrt(S_o S_i) of the media at both ends, or S of one, at a query in scene units, 1/((scene unit)² sr).
-
-        With derivatives by the media where they are followed.
-        """
+        With derivatives by the media where they are followed."""
         by_albedo, by_sigma_t = (any(dr.grad_enabled(getattr(end, key)) for end in ends) for key in SLOPED)
         with dr.suspend_grad():
             ask = self._of_networks if self.networks else self._at_ends
@@ -227,9 +214,7 @@ class Palette:
         active: mi.Bool,
     ) -> tuple[mi.Spectrum, list[Slope]]:  # fmt: skip
         """S, and the slopes of each end and channel, 0 where they are not asked for.
-
-        A loop over ends and channels, so that models are recorded once.
-        """
+        A loop over ends and channels, so that models are recorded once."""
         n, lanes, tables = len(self.rows), dr.width(query[0]), self._tables()
 
         def step(k: mi.UInt32, result: mi.Spectrum, slopes: list[Slope]) -> tuple[mi.UInt32, mi.Spectrum, list[Slope]]:
@@ -434,12 +419,8 @@ def _albedo_of_v(v: Number, g: Number, c: Number) -> Number:
 @dataclass(frozen=True, eq=False)
 class PaletteTransport(Transport):
     """S = sqrt(S_o S_i) of the media at both ends, or S of that at the wavelengths of a ray.
-
-    Args:
-        palette: the models.
-        medium: what varies, 1/(scene unit).
-        geometry: "distance" or "tangent", see `points.separation`.
-    """
+    `palette`: the models. `medium`: what varies, 1/(scene unit). `geometry`: "distance" or "tangent", see
+    `points.separation`."""
 
     palette: Palette
     obj: Geometry
@@ -472,15 +453,8 @@ def palette_model(
     name: str, geometry: Geometry, media: tuple[Medium, ...], medium: Varied, settings: Settings
 ) -> ObjectModel:
     """The transport and the proposals of a half-space model on an object whose medium has textures or spectra.
-
-    Args:
-        media: of each channel, 1/(scene unit); their g and eta hold.
-        medium: what varies, 1/(scene unit).
-        settings: geometry and share of uniform entries.
-
-    Raises:
-        ValueError: the model knows some media only.
-    """
+    `media`: of each channel, 1/(scene unit); their g and eta hold. `medium`: what varies, 1/(scene unit). `settings`:
+    geometry and share of uniform entries. ValueError if the model knows some media only."""
     palette = palette_of(name, geometry, media, medium)
     models = _spread(name, *_values_of(geometry, media, medium), media)
     table = radial_table(models, name, geometry)

@@ -49,10 +49,7 @@ HIGHEST = 60.0  # of a logit, for the range of float32
 
 def mesh_faces(obj: TranslucentObject) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Centroids (n, 3), unit normals (n, 3) and areas (n,) of the faces.
-
-    Raises:
-        ValueError: the shape is no mesh.
-    """
+    ValueError if the shape is no mesh."""
     if not mesh.has_faces(obj.geometry.shape):
         raise ValueError(f"shape must be a mesh to be cut into patches, got {obj.geometry.shape.class_name()}")
     a, b, c = mesh.face_corners(obj.geometry.shape)
@@ -90,10 +87,7 @@ def cluster(
 
 class Patches:
     """Faces by patch, and uniform points of a patch.
-
-    Args:
-        centres: from `cluster`, of this object or of the one that was trained.
-    """
+    `centres`: from `cluster`, of this object or of the one that was trained."""
 
     def __init__(self, obj: TranslucentObject, frame: ObjectFrame, centres: np.ndarray) -> None:
         from scipy.spatial import cKDTree
@@ -141,11 +135,8 @@ class PatchWeights(NamedTuple):
 @dataclass(frozen=True, eq=False)
 class PatchSampler:
     """Points of entry by learnt weights of patches.
-
-    Args:
-        patches: of its surface.
-        weights: V_k (outputs, inputs) and c_k of the layers; the last has one output for each patch.
-    """
+    `patches`: of its surface. `weights`: V_k (outputs, inputs) and c_k of the layers; the last has one output for each
+    patch."""
 
     frame: ObjectFrame
     patches: Patches
@@ -223,10 +214,7 @@ class _CumulativeRow:
 
 class WeightTable:
     """Weights of exits or cells, looked up by their number.
-
-    Args:
-        weights: of all patches, (exits, patches).
-    """
+    `weights`: of all patches, (exits, patches)."""
 
     def __init__(self, weights: np.ndarray) -> None:
         rows = np.cumsum(weights, axis=1).astype(np.float32)
@@ -243,11 +231,7 @@ class WeightTable:
 
 class PatchTable:
     """The table of an object.
-
-    Args:
-        sampler: whose network is asked, once.
-        cells: at most so many.
-    """
+    `sampler`: whose network is asked, once. `cells`: at most so many."""
 
     def __init__(self, sampler: PatchSampler, cells: int = CELLS) -> None:
         obj, n = sampler.patches.object, len(sampler.patches.of_face)

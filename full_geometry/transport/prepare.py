@@ -138,10 +138,8 @@ def _check_takes(geometry: Geometry, spec: MediumSpec, single_only: bool) -> Non
 
 def _low_orders(spec: MediumSpec, transport: Transport | None, corrected: bool) -> tuple[int, ...]:
     """The orders below two that are traced beside a transport.
-
     No light passes a half-space: its models put into orders from two on what passes something thin, which a correction
-    takes out of them.
-    """
+    takes out of them."""
     if spec.orders != "total":
         return (1,) if spec.orders == "single" else ()
     if transport is not None and transport.orders == "total":
@@ -183,10 +181,7 @@ def _check_object(obj: TranslucentObject, model: str, takes: Capabilities) -> No
 
 class TranslucentObjects:
     """The objects of the scene that was asked for last, made anew when its objects, their shape or media changed.
-
-    Args:
-        choose: says what stands for "auto".
-    """
+    `choose`: says what stands for "auto"."""
 
     def __init__(self, settings: Settings, choose: Chooser) -> None:
         self.settings, self.choose = settings, choose

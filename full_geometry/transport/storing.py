@@ -89,10 +89,7 @@ class Identity:
 
     def pose(self, other: Identity) -> tuple[np.ndarray, np.ndarray]:
         """R and t with R x + t = y for the points x of this object and y of the other, which is the same one moved.
-
-        Raises:
-            ValueError: it is another object; says in what.
-        """
+        ValueError if it is another object; says in what."""
         pairs = (
             ("kind", "shape", "without faces"), ("topology", "mesh", "without faces"), ("grids", "grids", "none"),
             ("contents", "inclusions", "nothing"), ("textures", "textures", "none"),
@@ -175,10 +172,7 @@ def _anchored(shape: mi.Shape) -> tuple[str, np.ndarray]:
 
 def _contents(obj: TranslucentObject, anchors: np.ndarray) -> tuple[str, list[np.ndarray]]:
     """Digest of what lies inside, in an order that the order in the scene has no part in, and anchors of each.
-
-    Args:
-        anchors: its own; of those that are alike inside, the nearest to the first of them comes first.
-    """
+    `anchors`: its own; of those that are alike inside, the nearest to the first of them comes first."""
     inclusions, results = obj.geometry.inclusions, []
     if inclusions is None:
         return "", []
@@ -219,9 +213,7 @@ def _digest_of_textures(obj: TranslucentObject) -> str:
 
 def _as_trained(obj: TranslucentObject, medium: dict[str, Any]) -> TranslucentObject:
     """The same with the homogeneous equivalent of training, see `Identity`; itself where the medium is homogeneous.
-
-    Another equivalent, over the random points that the object has where it stands now, would be another S_0.
-    """
+    Another equivalent, over the random points that the object has where it stands now, would be another S_0."""
     if obj.varying is None or len(medium["albedo"]) != len(obj.media):
         return obj
     known = zip(medium["albedo"], medium["size_in_mfp"], medium["g"])
@@ -246,9 +238,7 @@ def _digest_of_grids(obj: TranslucentObject) -> str:
 
 def _probed(obj: TranslucentObject, anchors: np.ndarray) -> np.ndarray:
     """sigma_t and sigma_s times sqrt(area) at points that move with the shape, (2 channels, points); none if constant.
-
-    They tell grids that lie elsewhere in the object, or are interpolated in another way.
-    """
+    They tell grids that lie elsewhere in the object, or are interpolated in another way."""
     if obj.varying is None:
         return np.zeros((0, 0), dtype=np.float32)
     centre, some = anchors.mean(axis=0), anchors[:: max(len(anchors) // PROBED, 1)]
@@ -273,14 +263,8 @@ def _check_same(trained: np.ndarray, here: np.ndarray) -> None:
 
 def frame_of(obj: TranslucentObject, trained: Identity | None = None, turns: np.ndarray | None = None) -> ObjectFrame:
     """The frame of the features; that of training for an object that has been moved since.
-
-    Args:
-        trained: as it was trained.
-        turns: of its surroundings then.
-
-    Raises:
-        ValueError: the object is not the one that was trained.
-    """
+    `trained`: as it was trained. `turns`: of its surroundings then. ValueError if the object is not the one that was
+    trained."""
     here = identify(obj)
     R, t = (np.eye(3), np.zeros(3)) if trained is None else trained.pose(here)
     anchors = here.anchors if trained is None else trained.anchors
@@ -333,10 +317,7 @@ def save(folder: str | os.PathLike, identity: Identity, arrays: dict[str, np.nda
 
 def find_weights(obj: TranslucentObject, folder: str | os.PathLike | None = None) -> Path:
     """The file of weights of an object.
-
-    Raises:
-        ValueError: there is none; says what tells the object from the nearest one that was trained.
-    """
+    ValueError if there is none, which says what tells the object from the nearest one that was trained."""
     here = identify(obj)
     place = path_of(folder or weights_folder())
     reasons = []
@@ -370,11 +351,8 @@ def nearest(
     obj: TranslucentObject, recipe: Mapping[str, Any], folder: str | os.PathLike | None = None
 ) -> Neighbour | None:
     """Weights of the same shape with the medium that is most alike, from which a training may start; None without any.
-
-    Args:
-        obj: the object; weights are of homogeneous media with nothing inside.
-        recipe: of its training; sizes and base model must be those of the weights.
-    """
+    `obj`: the object; weights are of homogeneous media with nothing inside. `recipe`: of its training; sizes and base
+    model must be those of the weights."""
     here, found = identify(obj), []
     if here.grids or here.contents or here.textures:
         return None
@@ -448,10 +426,7 @@ def _checked_base(path: Path, record: dict[str, Any], obj: TranslucentObject) ->
 
 def load(path: str | os.PathLike, obj: TranslucentObject) -> Learnt:
     """The model of an object and its sampler from its weights.
-
-    Raises:
-        ValueError: the file is damaged, of another kind or version, or of another object.
-    """
+    ValueError if the file is damaged, of another kind or version, or of another object."""
     path = Path(path)
     identity, arrays, record = _trained(path)
     try:
@@ -473,10 +448,7 @@ def load(path: str | os.PathLike, obj: TranslucentObject) -> Learnt:
 
 def base_model(obj: TranslucentObject, name: str) -> BaseModel:
     """What the network of an object begins with: the network of all shapes, or a half-space model.
-
-    Raises:
-        ValueError: there is no such model, or it does not take the medium.
-    """
+    ValueError if there is no such model, or it does not take the medium."""
     if name == shapes.KIND and obj.textured is not None:
         refuse_textures(obj.geometry.name, f"the base model {name!r}")
     return shapes.transport(obj) if name == shapes.KIND else HalfSpace(obj, name)
@@ -520,11 +492,8 @@ ENTRIES = 2  # of an exit: its own work is done once, and patches draw without a
 
 def learnt_model(obj: TranslucentObject, settings: Settings) -> ObjectModel:
     """Transport and proposals of an object that was trained.
-
-    Raises:
-        ValueError: the object cannot be trained or was not, which says the command that trains it; or weights are
-            damaged.
-    """
+    ValueError if the object cannot be trained or was not, which says the command that trains it; or weights are
+    damaged."""
     geometry = obj.geometry
     check_geometry(geometry)
     path = find_weights(obj)

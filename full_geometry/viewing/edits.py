@@ -102,15 +102,8 @@ def name_nodes(state: ParserState) -> None:
 
 def change(state: ParserState, edits: Edits, turned: np.ndarray) -> None:
     """Make changes of a scene, as it was parsed.
-
-    Args:
-        state: of the scene.
-        edits: what is changed.
-        turned: the transformation (4, 4) of its light.
-
-    Raises:
-        ValueError: an emitter has a radiance that cannot be scaled, or there is no such object.
-    """
+    `state`: of the scene. `edits`: what is changed. `turned`: the transformation (4, 4) of its light. ValueError if an
+    emitter has a radiance that cannot be scaled, or there is no such object."""
     _change_light(state, edits, mi.ScalarAffineTransform4d(turned), 2.0**edits.stops)
     names = names_of(state)
     for name, medium in edits.media.items():

@@ -217,12 +217,8 @@ class LiveScene:
 
     def passes(self, camera: Camera, way: Way, seed: int = 0) -> Iterator[Shown]:
         """Images of the scene as it is: a coarse one, then means of ever more passes.
-
-        Work is cancelled by `halfspace_sss.interrupts.cancellable`, and then leaves what is known whole.
-
-        Raises:
-            ValueError: the integrator refuses the scene.
-        """
+        Work is cancelled by `halfspace_sss.interrupts.cancellable`, and then leaves what is known whole. ValueError if
+        the integrator refuses the scene."""
         started, integrator, denoise = time.perf_counter(), self.integrator(way), None
         # the walks of a correction come after the first image
         draw = integrator.preview if is_bssrdf(integrator) else integrator.render

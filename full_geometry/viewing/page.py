@@ -176,11 +176,7 @@ class Page:
 
 def view(scene: dict | str | Path, **options: object) -> Page:
     """Serve a scene to browsers, and in a notebook show it below the cell; `Page.close` ends it.
-
-    Args:
-        scene: the path of an XML file, or a dict as for `mitsuba.load_dict`.
-        options: as of `Page`.
-    """
+    `scene`: the path of an XML file, or a dict as for `mitsuba.load_dict`. `options`: as of `Page`."""
     return Page(scene, **options)
 
 
@@ -372,10 +368,8 @@ def _guarded(token: str, cookie: str) -> Iterator[None]:
 
 def refusal(path: str, headers: Mapping[str, str], token: str, cookie: str) -> tuple[HTTPStatus | None, dict[str, str]]:
     """The status with which a request is answered instead of the page, and headers; None where it may pass.
-
     Pages of others may not connect: their origin is another, or the name they found us by is. With a token its address
-    sets a cookie, and nobody passes without that.
-    """
+    sets a cookie, and nobody passes without that."""
     host, origin = headers.get("Host", ""), headers.get("Origin")
     if origin is not None and urlsplit(origin).netloc != host:
         return HTTPStatus.FORBIDDEN, {}

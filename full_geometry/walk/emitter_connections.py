@@ -99,9 +99,7 @@ class SubpathConnections:
 
     def covers(self, k: mi.Int32, y: mi.Point3f, w: mi.Vector3f, pivot: mi.Point3f) -> mi.Bool:
         """Whether connections at `pivot` find light from the point y of emitter k along -w; no emitter has k < 0.
-
-        The line must cross the plane through the pivot steeply on its way from the emitter.
-        """
+        The line must cross the plane through the pivot steeply on its way from the emitter."""
         # |w.w_0| > `STEEPEST`, from an emitter that looks small and is on the other side of the plane
         near = dr.maximum(k, 0)
         w_0, small = self.small.direction(near, pivot)
@@ -231,9 +229,7 @@ class SubpathConnections:
 
     def _connect(self, walk: Walk, event: Event, t: mi.Float, over: mi.Float) -> tuple[mi.Spectrum, Score | tuple[()]]:
         """Light of a connection at the distance t on a ray of light, and its score after that of the subpath.
-
-        `over` is one over the density of t.
-        """
+        `over` is one over the density of t."""
         # ---- weight sigma_s(q) p(cos_p) p(cos_q) / density of t; |p - q|² has cancelled
         media, q = self.media, mi.Point3f(walk.o + walk.d * t)
         e, between = media.row("rounding", event.object), event.p - q
@@ -307,9 +303,7 @@ def find_connections(
     scene: mi.Scene, media: WalkMedia, small: SmallEmitters | None, share: float, scored: bool = False
 ) -> SubpathConnections | None:
     """Connections with the small emitters of a scene; None without any, or without an object of smooth boundary.
-
-    Where nothing refracts, `straight_light` needs none.
-    """
+    Where nothing refracts, `straight_light` needs none."""
     if small is None or share == 0 or not media.any_refracts:
         return None
     if media.inner is not None and not np.array(media.inner.tables["alone"]).any():

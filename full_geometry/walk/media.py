@@ -69,11 +69,8 @@ class InclusionTable:
     @classmethod
     def of(cls, scene: mi.Scene, objects: list[Geometry]) -> InclusionTable | None:
         """What lies inside; None if nothing does.
-
-        Raises:
-            ValueError: something inside that refracts is not closed, objects count some orders only, or as of
-                `Priorities.of`.
-        """
+        ValueError if something inside that refracts is not closed, objects count some orders only, or as of
+        `Priorities.of`."""
         result = find_inclusions(scene, objects)
         if not result:
             return None
@@ -225,10 +222,8 @@ class HeterogeneousMedia:
 
     def transmittance(self, k: mi.Int32, ray: mi.Ray3f, distance: mi.Float, rng: mi.PCG32) -> mi.Spectrum:
         """An unbiased estimate of exp(-∫ sigma_t) over a distance along a ray inside object k: ratio tracking.
-
-        Collisions are drawn by the largest majorant M of the channels; each is null, with the weight
-        1 - sigma_t,c / M (Novak, Selle and Jarosz 2014).
-        """
+        Collisions are drawn by the largest majorant M of the channels; each is null, with the weight 1 - sigma_t,c / M
+        (Novak, Selle and Jarosz 2014)."""
         # the first collision, t = -ln(1 - u) / M
         M = dr.max(self.majorant(k))
         o, d = mi.Point3f(ray.o), mi.Vector3f(ray.d)
@@ -264,9 +259,7 @@ def per_channel(rows: list[float | np.ndarray], scale: float) -> list[mi.Float]:
 
 def _shares(medium: Medium) -> np.ndarray:
     """Probability of each channel of a walk: a part evenly, the rest by the light that a half-space sends back.
-
-    About (1 - s) (1 - 0.139 s) / (1 + 1.17 s) of it, s² = (1 - a) / (1 - a g) for the albedo a (van de Hulst 1980).
-    """
+    About (1 - s) (1 - 0.139 s) / (1 + 1.17 s) of it, s² = (1 - a) / (1 - a g) for the albedo a (van de Hulst 1980)."""
     albedo = np.atleast_1d(medium.albedo).astype(float)
     s = np.sqrt((1 - albedo) / np.maximum(1 - albedo * medium.g, 1e-6))
     R = np.maximum((1 - s) * (1 - 0.139 * s) / (1 + 1.17 * s), 1e-6)
@@ -620,9 +613,7 @@ class WalkMedia:
 
     def depart(self, si: mi.SurfaceInteraction3f, d: mi.Vector3f, inside: mi.Bool) -> tuple[mi.Point3f, mi.Vector3f]:
         """Where a way along d from a surface begins, and how far from there its ray, if it runs inside.
-
-        A walk that began where its ray begins would lie deeper, so that light that is scattered once were lost.
-        """
+        A walk that began where its ray begins would lie deeper, so that light that is scattered once were lost."""
         # inside it begins at the surface and its ray `off` from there, outside clear of the surface
         off = clear(si.n, d, self.instance_scene.rounding(si))
         return dr.select(inside, si.p, mi.Point3f(si.p + off)), dr.select(inside, off, 0)
@@ -658,9 +649,7 @@ class WalkMedia:
 
     def draw(self, si: mi.SurfaceInteraction3f, d: mi.Vector3f, rng: mi.PCG32) -> tuple[mi.Int32, mi.BSDFPtr]:
         """The number of the object that a ray along d meets from outside, -1 for another surface, and the BSDF of that.
-
-        Masks and blends may show another surface where an object is.
-        """
+        Masks and blends may show another surface where an object is."""
         # what a mask or blend has drawn is another surface than that of the object
         k, bsdf = self.index_of(si), si.bsdf()
         for number, around in enumerate(self.wrappings):
@@ -674,11 +663,8 @@ class WalkMedia:
     @classmethod
     def of(cls, scene: mi.Scene, mm_per_unit: float) -> WalkMedia:
         """The objects of a scene whose surface is `translucent`.
-
-        Raises:
-            ValueError: mm_per_unit is out of range, there is no object, one is a sheet, the medium of an instance
-                varies in space, or as `InclusionTable.of` and `check_sheets`.
-        """
+        ValueError if mm_per_unit is out of range, there is no object, one is a sheet, the medium of an instance varies
+        in space, or as `InclusionTable.of` and `check_sheets`."""
         check_interval("mm_per_unit", mm_per_unit, *MM_PER_UNIT)
         # ---- the geometry of each shape, and whether its medium can be there
         shapes, shown = translucent_shapes(scene), shown_groups(scene)

@@ -226,12 +226,8 @@ class StartVisitor(Visitor, Protocol):
 @dataclass(frozen=True, eq=False)
 class Walker:
     """A walk inside translucent objects.
-
-    Args:
-        media: the objects.
-        visitor: what is recorded.
-        roulette_from: scattering events from which on roulette may end a walk.
-    """
+    `media`: the objects. `visitor`: what is recorded. `roulette_from`: scattering events from which on roulette may end
+    a walk."""
 
     media: WalkMedia
     visitor: Visitor
@@ -474,11 +470,7 @@ class WalkExits(NamedTuple):
 @dataclass(frozen=True, eq=False)
 class ExitVisitor:
     """Stores each exit at the number of its walk, which is its record, and ends the walk there.
-
-    Args:
-        exits: where they are stored.
-        fewest, most: orders that are kept.
-    """
+    `exits`: where they are stored. `fewest`, `most`: orders that are kept."""
 
     exits: WalkExits
     fewest: mi.UInt32
@@ -527,18 +519,9 @@ def exits(
     fewest: int = 0,
     most: int = MOST,
 ) -> WalkExits:
-    """Where walks from points on object k leave it.
-
-    Args:
-        media, k, start, seed: as of `walk_from`.
-        fewest, most: numbers of scattering events that are kept, among the orders of the object.
-
-    Returns:
-        Exits in the order of the starts.
-
-    Raises:
-        ValueError: there is no object k, or the arrays of `start` are of different lengths.
-    """
+    """Where walks from points on object k leave it. `media`, `k`, `start`, `seed`: as of `walk_from`. `fewest`, `most`:
+    numbers of scattering events that are kept, among the orders of the object. Returns exits in the order of the
+    starts. ValueError if there is no object k, or the arrays of `start` are of different lengths."""
     visitor = ExitVisitor.of(dr.width(start.p), fewest, most)
     walk_from(media, k, start, visitor, seed)
     evaluate(visitor.exits)

@@ -225,12 +225,8 @@ class PathScores:
 @dataclass(frozen=True, eq=False)
 class ScoreVisitor:
     """Another visitor, beside which the scores of paths are summed.
-
-    Args:
-        visitor: the other one, whose record has L and `slopes`.
-        media: the objects.
-        scores: where stays are summed.
-    """
+    `visitor`: the other one, whose record has L and `slopes`. `media`: the objects. `scores`: where stays are
+    summed."""
 
     visitor: Visitor
     media: WalkMedia
@@ -293,12 +289,7 @@ class ScoredWalk:
 @dataclass(frozen=True, eq=False)
 class ScoredExitVisitor:
     """Stores exits, and the score of each walk at its exit; of objects with nothing inside and without textures.
-
-    Args:
-        exits: stores them without scores.
-        media: the objects.
-        scores: where those of the exits are stored.
-    """
+    `exits`: stores them without scores. `media`: the objects. `scores`: where those of the exits are stored."""
 
     exits: ExitVisitor
     media: WalkMedia
@@ -333,10 +324,7 @@ def scored_exits(
     media: WalkMedia, k: int, start: SurfacePoint, seed: int | tuple[int, ...], fewest: int = 0
 ) -> tuple[WalkExits, Score]:
     """`random_walk.exits`, with the score of each walk up to its exit.
-
-    Raises:
-        ValueError: as there.
-    """
+    ValueError as there."""
     n = dr.width(start.p)
     # the walks of `exits` with the same random numbers
     visitor = ScoredExitVisitor(ExitVisitor.of(n, fewest), media, Score.zeros(n))
@@ -351,10 +339,7 @@ def scored_exits(
 
 def followed(media: WalkMedia) -> list[tuple[int, dict[str, mi.Spectrum]]]:
     """The number and the coefficients (scene units) of each object with gradients enabled.
-
-    Raises:
-        ValueError: the albedo of one of them, which must have gradients, is 0 in a channel.
-    """
+    ValueError if the albedo of one of them, which must have gradients, is 0 in a channel."""
     result = []
     for k, obj in enumerate(media.objects):
         surface, unit = surface_of(obj.shape), {"sigma_t": media.mm_per_unit}
@@ -369,10 +354,7 @@ def followed(media: WalkMedia) -> list[tuple[int, dict[str, mi.Spectrum]]]:
 
 def followed_textures(media: WalkMedia) -> dict[int, TexturedMedium]:
     """The number and the textures (scene units) of each object with gradients enabled in texels or attributes.
-
-    Raises:
-        ValueError: the albedo of one of them is 0 somewhere.
-    """
+    ValueError if the albedo of one of them is 0 somewhere."""
     # d log f has n / albedo: no channel may be black
     result = {}
     for k, (obj, inside) in enumerate(zip(media.objects, media.specs)):

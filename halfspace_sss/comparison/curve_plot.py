@@ -52,9 +52,7 @@ def render(curves: PlottedCurves) -> dict[str, bytes]:
 
 def draw(curves: PlottedCurves) -> Figure:
     """One column for each direction of incidence: above S(r) with 2 standard errors, below S over path-traced S.
-
-    Without a path-traced curve there is nothing below.
-    """
+    Without a path-traced curve there is nothing below."""
     angles, rows = curves.theta_i_deg, 2 if TRACED in curves.series else 1
     blocks = -(-len(angles) // MOST_COLUMNS)
     columns = -(-len(angles) // blocks)

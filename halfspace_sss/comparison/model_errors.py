@@ -241,9 +241,7 @@ def model_error(model: BSSRDF, reference: TracedMaps, within: tuple[float, float
 
 def _known(deviation: np.ndarray, noise: np.ndarray, energy: np.ndarray) -> NoiseFree:
     """(sum deviation / sum energy)² - (sum noise / sum energy)² of directions of incidence, and its standard error.
-
-    By the jackknife over the directions; twice the variance, as each pair of them stands in the maps of both.
-    """
+    By the jackknife over the directions; twice the variance, as each pair of them stands in the maps of both."""
 
     def square(*sums: float | np.ndarray) -> float | np.ndarray:
         a, b, total = sums

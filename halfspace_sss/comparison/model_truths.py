@@ -34,9 +34,7 @@ LEAST_MU = 1e-7
 
 class SampledExits(NamedTuple):
     """Distances r (mm), outside cosines and fluxes of light that leaves, a row for each cosine of incidence.
-
-    The fluxes of a row sum up to R(mu_i).
-    """
+    The fluxes of a row sum up to R(mu_i)."""
 
     r: np.ndarray
     mu_o: np.ndarray
@@ -55,11 +53,8 @@ class _Points(NamedTuple):
 
 def exits(model: BSSRDF, mu_i: Sequence[float | str], points: int, seed: Sequence[int]) -> SampledExits:
     """Light that leaves for light that enters at each of the cosines mu_i, or for uniform radiance, "diffuse".
-
-    Args:
-        model: of a scalar medium; evaluated in single precision.
-        points: of each of the three proposals, a power of two; scrambled Sobol points, others for each row.
-    """
+    `model`: of a scalar medium; evaluated in single precision. `points`: of each of the three proposals, a power of
+    two; scrambled Sobol points, others for each row."""
     rows = [_draw(model, mu, points, (*seed, k)) for k, mu in enumerate(mu_i)]
     p = _Points(*(np.stack(values) for values in zip(*rows)))
     S = evaluated(model, (p.r, p.mu_i, math.pi - p.psi, p.mu_o, p.delta - p.psi))
@@ -129,14 +124,8 @@ def reflectance_truths(
     kept: dict[str, list[float]] | None = None,
 ) -> pandas.DataFrame:
     """One row per true reflectance and model that accepts its medium: truth, model's value at total order, error.
-
-    Args:
-        names: of models; None for all.
-        progress: called with (what, done, total).
-        kept: reflectances found before; new ones are added.
-
-    Media without scattering are left out; R_total includes the surface reflection.
-    """
+    `names`: of models; None for all. `progress`: called with (what, done, total). `kept`: reflectances found before;
+    new ones are added. Media without scattering are left out; R_total includes the surface reflection."""
     import pandas
 
     names, result = list(models() if names is None else names), {} if kept is None else kept
@@ -186,9 +175,7 @@ def _reflectance(model: BSSRDF, mu_i: float | str) -> list[float]:
 
 def sampled_reflectance(model: BSSRDF, mu_i: float | str, points: int = POINTS) -> tuple[float, float]:
     """R(mu_i) = ∫∫ S mu_o dw_o dA of a scalar medium by quasi Monte Carlo (`exits`), and its error.
-
-    mu_i is a cosine or "diffuse". The error is that of the mean of independent scrambles.
-    """
+    mu_i is a cosine or "diffuse". The error is that of the mean of independent scrambles."""
     values = exits(model, [mu_i] * REPEATS, points, (0,)).flux.sum(axis=1)
     return float(values.mean()), float(values.std(ddof=1) / math.sqrt(REPEATS))
 

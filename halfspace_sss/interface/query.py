@@ -12,10 +12,8 @@ from halfspace_sss.physics.fresnel import mu_internal, sine
 @dataclass(frozen=True)
 class Query:
     """A half-space query in mean free paths, with refracted cosines, in one array library.
-
-    The refracted directions of travel, in a frame whose x axis points from x_i to x_o and z outwards, are
-    w_12 = (-sin_i cos phi_i, -sin_i sin phi_i, -mu_i_in) and w_21 = (sin_o cos phi_o, sin_o sin phi_o, mu_o_in).
-    """
+    The refracted directions of travel, in a frame whose x axis points from x_i to x_o and z outwards, are w_12 =
+    (-sin_i cos phi_i, -sin_i sin phi_i, -mu_i_in) and w_21 = (sin_o cos phi_o, sin_o sin phi_o, mu_o_in)."""
 
     lib: Library
     r: Real

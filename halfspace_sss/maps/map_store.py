@@ -280,9 +280,7 @@ def _template(medium: Medium, grid: MapGrid, seed: int) -> xr.Dataset:
 
 def _create(path: Path, medium: Medium, grid: MapGrid, seed: int, asked: JsonDict) -> None:
     """A store of the right shape, made under another name and renamed; in an object store, with its metadata last.
-
-    Encoded in memory: zarr's threads, which an interrupt does not end, would write on into a folder just removed.
-    """
+    Encoded in memory: zarr's threads, which an interrupt does not end, would write on into a folder just removed."""
     dataset, memory = _template(medium, grid, seed), {}
     dataset.attrs |= {ASKED: json.dumps(asked, sort_keys=True), "provenance": json.dumps(provenance())}
     dataset.attrs |= written_checksums(dataset)

@@ -29,11 +29,8 @@ PILOT_LANES, PILOT_PATHS, PASS_LANES = 8192, 16, 65536
 @dataclass(frozen=True)
 class MapUnit:
     """What one unit traces: a scalar medium, its grid, which direction of incidence, seeds, and when to stop.
-
-    Args:
-        target_error: mean cell error to reach, see `trace_unit`; None to trace `n_paths` exactly.
-        n_paths: walks for each group of 16 observations, or the most that are traced for `target_error`.
-    """
+    `target_error`: mean cell error to reach, see `trace_unit`; None to trace `n_paths` exactly. `n_paths`: walks for
+    each group of 16 observations, or the most that are traced for `target_error`."""
 
     medium: Medium
     grid: MapGrid

@@ -73,10 +73,7 @@ class MaterialFile(_Strict):
 
 def read(path: Path) -> list[Material]:
     """The materials of a file.
-
-    Raises:
-        ValueError: the file cannot be read, or `parse` refuses it.
-    """
+    ValueError if the file cannot be read, or `parse` refuses it."""
     try:
         text = read_text(path)
     except (OSError, UnicodeDecodeError) as error:
@@ -86,10 +83,7 @@ def read(path: Path) -> list[Material]:
 
 def parse(text: str, origin: str) -> list[Material]:
     """The materials in the text of a file called `origin`.
-
-    Raises:
-        ValueError: the text is no TOML, or a key, unit, value or combination is wrong; names file, key, bound, value.
-    """
+    ValueError if the text is no TOML, or a key, unit, value or combination is wrong; names file, key, bound, value."""
     try:
         raw = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

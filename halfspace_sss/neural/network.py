@@ -80,10 +80,8 @@ def symmetric_features(lib: Library, r: Real, incoming: Ray, outgoing: Ray, L: R
 
 def _meeting(lib: Library, r: Real, incoming: Ray, outgoing: Ray) -> tuple[Real, Real]:
     """How closely the refracted rays pass each other, and how far light travels until there.
-
-    At depth z they are |r - z v| apart, v = d_i/mu_i' + d_o/mu_o' in the plane; the least is at
-    z = r v_x / (v² + 0.05). Returns log(|r - z v| / r) and p / (1 + p) of the path p = z (1/mu_i' + 1/mu_o').
-    """
+    At depth z they are |r - z v| apart, v = d_i/mu_i' + d_o/mu_o' in the plane; the least is at z = r v_x / (v² +
+    0.05). Returns log(|r - z v| / r) and p / (1 + p) of the path p = z (1/mu_i' + 1/mu_o')."""
     (x_i, y_i, mu_i), (x_o, y_o, mu_o) = incoming, outgoing
     a, b = 1 / lib.maximum(mu_i, 1e-3), 1 / lib.maximum(mu_o, 1e-3)
     v_x, v_y = a * x_i + b * x_o, a * y_i + b * y_o
@@ -137,12 +135,8 @@ RELU = Activation(lambda h: np.maximum(h, 0, out=h), lambda h: h.clamp_min(0), r
 @dataclass(frozen=True, eq=False)
 class Network:
     """h_{k+1} = a(h_k W_k + b_k), the last layer without a.
-
-    Args:
-        matrices: W_k of shape (inputs, outputs), NumPy float32, or tensors with derivatives.
-        biases: b_k of shape (outputs,).
-        activation: a, SILU or RELU.
-    """
+    `matrices`: W_k of shape (inputs, outputs), NumPy float32, or tensors with derivatives. `biases`: b_k of shape
+    (outputs,). `activation`: a, SILU or RELU."""
 
     matrices: tuple[np.ndarray, ...]
     biases: tuple[np.ndarray, ...]
@@ -256,9 +250,7 @@ def log_calibrations(c: Sequence[Real], q: Query) -> Real:
 
 def factored_G(network: Network, q: Query, albedo: Real, g: Real, eta: Real, calibration: Sequence[float] = ()) -> Real:
     """G = B(r) exp(network(features)) a(mu_i) a(mu_o) of one channel: positive, reciprocal and mirror-invariant.
-
-    `calibration` are the coefficients of log a, see `log_calibration`; without them a is 1.
-    """
+    `calibration` are the coefficients of log a, see `log_calibration`; without them a is 1."""
     lib, L = q.lib, q.constant(length_scale(albedo, g))
     log_factor = network(symmetric_features(lib, q.r, *travel(q), L))
     if len(calibration):
@@ -270,9 +262,7 @@ def factored_G(network: Network, q: Query, albedo: Real, g: Real, eta: Real, cal
 
 class SymmetricModel(BSSRDF):
     """A learnt BSSRDF of order >= 2 that is positive, reciprocal and mirror-invariant by construction.
-
-    A model gives `networks`, the small network of each channel of its medium, and may give their `calibrations`.
-    """
+    A model gives `networks`, the small network of each channel of its medium, and may give their `calibrations`."""
 
     orders = "multiple"
     reciprocal = True

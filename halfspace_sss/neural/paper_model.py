@@ -24,12 +24,8 @@ def paper_inputs(
     lib: Library, r: Real, line: Real, w_i: tuple[Real, Real], w_o: tuple[Real, Real], L: Real
 ) -> list[Real]:
     """Six numbers: (x, y) of x_o - x_i over 4 L and the horizontal parts of w_i and w_o.
-
-    Args:
-        r: distance in mean free paths.
-        line: azimuth of x_o - x_i in a fixed frame; the network is not invariant under rotation.
-        w_i, w_o: sine and azimuth of the directions outside, in the same frame.
-    """
+    `r`: distance in mean free paths. `line`: azimuth of x_o - x_i in a fixed frame; the network is not invariant under
+    rotation. `w_i`, `w_o`: sine and azimuth of the directions outside, in the same frame."""
     rho = r / (RADIUS * L)
     parts = [f(azimuth) * sine for sine, azimuth in (w_i, w_o) for f in (lib.cos, lib.sin)]
     return [rho * lib.cos(line), rho * lib.sin(line), *parts]

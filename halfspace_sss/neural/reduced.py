@@ -50,12 +50,8 @@ RIDGE = 1e-6
 @dataclass(frozen=True, eq=False)
 class ReducedNetworks:
     """Functions phi of a query, and their coefficients for the albedo of each model.
-
-    Args:
-        networks: with phi_0 ... phi_4 for outputs, which are added up.
-        lengths: L of the features of each.
-        coefficients: c of the models, shape (models, MODES).
-    """
+    `networks`: with phi_0 ... phi_4 for outputs, which are added up. `lengths`: L of the features of each.
+    `coefficients`: c of the models, shape (models, MODES)."""
 
     networks: list[Network]
     lengths: list[float]

@@ -28,10 +28,7 @@ LARGEST = 1e4  # no weight of a network that works is as large
 
 def to_json(content: JsonDict) -> str:
     """The text of a JSON file with one line for each key; NumPy's numbers become Python's.
-
-    Raises:
-        TypeError: something in it has no form in JSON.
-    """
+    TypeError if something in it has no form in JSON."""
 
     def plain(value: object) -> object:
         if isinstance(value, np.generic):
@@ -88,11 +85,8 @@ def save_weights(path: str | os.PathLike, kind: str, arrays: Mapping[str, np.nda
 
 def load_weights(path: str | os.PathLike, kind: str) -> tuple[dict[str, np.ndarray], JsonDict]:
     """Arrays and record of a file of weights.
-
-    Raises:
-        ValueError: it is no such file, is truncated or altered, of another kind, version or shape, or holds numbers
-            that are not finite; the message names the file.
-    """
+    ValueError if it is no such file, is truncated or altered, of another kind, version or shape, or holds numbers that
+    are not finite; the message names the file."""
     path = path_of(path)
     record = _read_record(path, kind)
     try:
@@ -216,10 +210,7 @@ def check_medium(path: Path, record: JsonDict, medium: Medium) -> None:
 
 def find_weights(kind: str, medium: Medium) -> Path:
     """The file of weights of a scalar medium, the user's before the shipped one.
-
-    Raises:
-        ValueError: there is none; says how to train it.
-    """
+    ValueError if there is none, which says how to train it."""
     name = weights_name(kind, medium)
     shipped = Path(str(resources.files("halfspace_sss.neural").joinpath("data")))
     for folder in (weights_folder(), shipped):

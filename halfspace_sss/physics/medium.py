@@ -81,10 +81,7 @@ def _common_shape(**fields: Real) -> tuple[int, ...]:
 
 def check_ratios(albedo: np.ndarray, g: np.ndarray, eta: np.ndarray) -> None:
     """Check arrays of what a half-space in mean free paths is made of, by the ranges of `Medium`.
-
-    Raises:
-        ValueError: an albedo is outside [0, 1], a g outside (-1, 1), an eta outside [0.01, 100].
-    """
+    ValueError if an albedo is outside [0, 1], a g outside (-1, 1), an eta outside [0.01, 100]."""
     _check("albedo", albedo, (albedo >= 0) & (albedo <= 1), "in [0, 1]")
     _check("g", g, np.abs(g) < 1, "in the open interval (-1, 1)")
     _check("eta", eta, *_between(eta, INDICES))
@@ -92,9 +89,7 @@ def check_ratios(albedo: np.ndarray, g: np.ndarray, eta: np.ndarray) -> None:
 
 def diffuse_limit(mfp: np.ndarray) -> np.ndarray:
     """Mean free paths of channels with 1e-3 of the largest in place of 0: light then leaves where it has entered.
-
-    Reflectance does not depend on it. Where all are 0 they stay so.
-    """
+    Reflectance does not depend on it. Where all are 0 they stay so."""
     mfp = np.asarray(mfp, dtype=float)
     return np.where(mfp == 0, DIFFUSE_LIMIT * np.max(mfp, initial=0.0), mfp)
 
@@ -413,10 +408,7 @@ class HasMedium(Protocol):
 
 def medium_of(given: Medium | HasMedium) -> Medium:
     """The medium of a material; anything else as it is, but for names, which `materials.load` takes.
-
-    Raises:
-        ValueError: it is a name.
-    """
+    ValueError if it is a name."""
     if isinstance(given, str):
         hint = f"`halfspace_sss.materials.load({given!r})` has the material of a name"
         raise ValueError(f"medium must be a Medium or a Material, got {given!r}; {hint}")

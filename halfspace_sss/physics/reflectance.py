@@ -277,12 +277,8 @@ def _slide_reflectance(mu: np.ndarray, eta: float, eta_slide: float) -> np.ndarr
 
 def directional_table(g: float, eta: float, x: np.ndarray, mu_in: np.ndarray) -> np.ndarray:
     """ln(R(mu) / (albedo F_t(mu))), shape (x, mu_in), which is smooth in both.
-
-    Args:
-        g, eta: as in `half_space_reflectance`.
-        x: in [0, 1], of the albedos 1 - albedo' = s², s = x / (c + (1 - c) x), c = (1 - max(g, 0))^(1/3).
-        mu_in: cosines inside, in [0, 1], of the directions mu outside.
-    """
+    `g`, `eta`: as in `half_space_reflectance`. `x`: in [0, 1], of the albedos 1 - albedo' = s², s = x / (c + (1 - c)
+    x), c = (1 - max(g, 0))^(1/3). `mu_in`: cosines inside, in [0, 1], of the directions mu outside."""
     result = []
     with one_blas_thread():
         for albedo in np.maximum(_albedo(np.asarray(x, dtype=float), g)[0], LEAST).tolist():
@@ -331,10 +327,8 @@ def _basis(eta: float, nodes: int = NODES) -> _Basis:
 
 def _nodes(n: int, eta: float) -> tuple[np.ndarray, np.ndarray]:
     """Gauss points of [0, 1], close together on both sides of the critical cosine c, where radiance has a kink.
-
     Below a small c there are few: all others would be too few for the polynomials of highest order, which are then not
-    orthogonal on the nodes.
-    """
+    orthogonal on the nodes."""
     if eta <= 1:
         return _gauss(n)
     c = math.sqrt((eta - 1) * (eta + 1)) / eta
@@ -351,14 +345,8 @@ def _gauss(n: int) -> tuple[np.ndarray, np.ndarray]:
 
 def albedo_of_reflectance(reflectance: np.ndarray, g: float, eta: float, mu_i: float | str = DIFFUSE) -> np.ndarray:
     """The albedo of single scattering of the half-space with the given reflectance.
-
-    Args:
-        reflectance: array of any shape, from 0 to that of albedo 1.
-        g, eta, mu_i: as in `half_space_reflectance`.
-
-    Raises:
-        ValueError: a reflectance is out of reach; bound and value are named.
-    """
+    `reflectance`: array of any shape, from 0 to that of albedo 1. `g`, `eta`, `mu_i`: as in `half_space_reflectance`.
+    ValueError if a reflectance is out of reach; bound and value are named."""
     _check(g, mu_i)
     R = np.asarray(reflectance, dtype=np.float64)
     x, values, polynomial = _inverse(float(g), float(eta), mu_i if mu_i == DIFFUSE else float(mu_i))
@@ -394,9 +382,7 @@ def _inverse(g: float, eta: float, mu_i: float | str) -> tuple[np.ndarray, np.nd
 
 def _albedo(x: np.ndarray, g: float) -> tuple[np.ndarray, np.ndarray]:
     """The albedo whose reduced one is 1 - s², and its derivative by x.
-
-    The albedo (1 - s²)/(1 - g s²) has its pole close to s = 1 for g near 1; c = (1 - g)^(1/3) moves it away in x.
-    """
+    The albedo (1 - s²)/(1 - g s²) has its pole close to s = 1 for g near 1; c = (1 - g)^(1/3) moves it away in x."""
     c = (1 - max(g, 0.0)) ** (1 / 3)
     below = c + (1 - c) * x
     s = x / below

@@ -112,10 +112,8 @@ def _graded(n_low: int, n_high: int, n_nodes: int) -> tuple[np.ndarray, np.ndarr
 
 def _mean_hg(g: Real, mu: Real, sine: Real, nu: Real, nu_sine: Real) -> tuple[Real, Real]:
     """Means over azimuth of p(c) and p(c) cos(delta_phi) for c = -mu nu + sine nu_sine cos(delta_phi).
-
-    1 + g² - 2 g c = A - B cos(delta_phi): with the complete elliptic integrals and m = 2B/(A + B), the integral of
-    (A - B cos)^(-3/2) is 4 E(m) / ((A - B) sqrt(A + B)), that of (A - B cos)^(-1/2) is 4 K(m) / sqrt(A + B).
-    """
+    1 + g² - 2 g c = A - B cos(delta_phi): with the complete elliptic integrals and m = 2B/(A + B), the integral of (A -
+    B cos)^(-3/2) is 4 E(m) / ((A - B) sqrt(A + B)), that of (A - B cos)^(-1/2) is 4 K(m) / sqrt(A + B)."""
     from scipy.special import ellipe, ellipkm1
 
     size, sign = np.abs(g), np.where(np.asarray(g) < 0, -1.0, 1.0)
@@ -135,10 +133,8 @@ def _mean_hg(g: Real, mu: Real, sine: Real, nu: Real, nu_sine: Real) -> tuple[Re
 
 def _exit_moments(medium: Medium, mu_i: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """R, R ⟨x⟩ and R ⟨r²⟩ (per mean free path) for mu_i of shape (n, 1), scalar or channel medium; shape (n, channels).
-
     Over u, the cosine on the thinner side (external for eta >= 1), which has no kink at the critical angle; the panels
-    halve towards u = 0, 1 and the backward peak of the phase function.
-    """
+    halve towards u = 0, 1 and the backward peak of the phase function."""
     eta = medium.eta
     g, albedo = np.atleast_1d(medium.g), np.atleast_1d(medium.albedo)
     x, _, w = _graded(20, 20, 10)

@@ -64,9 +64,7 @@ class MomentTally(Tally):
 
 class AngularTally(Tally):
     """Radiance towards given outside directions integrated over the plane, without Fresnel factors.
-
-    At each event: weight p(d.d_o) exp(-z/mu_o') / (eta² mu_o'), for each direction (single, multiple).
-    """
+    At each event: weight p(d.d_o) exp(-z/mu_o') / (eta² mu_o'), for each direction (single, multiple)."""
 
     def __init__(self, types: ModuleType, g: float, eta: float, mu_o: np.ndarray, delta_phi: np.ndarray) -> None:
         self.types = types
@@ -260,12 +258,8 @@ def launch_shape(n_paths: int, cuda: bool = False) -> tuple[int, int, int]:
 @dataclass(frozen=True)
 class Pass:
     """What one launch of the walk recorded, per incident flux: what enters is T_12 of it.
-
-    Attributes:
-        tallies, sums: the tallies of this pass and their per-lane sums.
-        T_i: transmittance T_12 of the beam of each lane.
-        per_lane, n_events: walks of each lane, scattering events of all.
-    """
+    `tallies`, `sums`: the tallies of this pass and their per-lane sums. `T_i`: transmittance T_12 of the beam of each
+    lane. `per_lane`, `n_events`: walks of each lane, scattering events of all."""
 
     tallies: list[Tally]
     sums: tuple

@@ -69,11 +69,8 @@ def torch_library() -> Library:
 
 class MapPool:
     """Maps of many groups as ratios to the backbone, ready to be drawn from.
-
-    Args:
-        groups, grid: what was traced.
-        halves: cell integrals of G, shape (n, 2, 16, n_u, n_psi), two independent estimates.
-    """
+    `groups`, `grid`: what was traced. `halves`: cell integrals of G, shape (n, 2, 16, n_u, n_psi), two independent
+    estimates."""
 
     def __init__(self, groups: Groups, grid: CellGrid, halves: np.ndarray) -> None:
         self.groups, self.grid = groups, grid
@@ -104,9 +101,7 @@ class MapPool:
 
     def batch(self, n_groups: int, n_queries: int, generator: torch.Generator) -> Batch:
         """Random cells, and two points in each, with the weight B r dr/du that the mean over the cell gives them.
-
-        The weight is taken as exponential in u within a cell. See `learners.cell_loss` for why two.
-        """
+        The weight is taken as exponential in u within a cell. See `learners.cell_loss` for why two."""
         n_psi = self.grid.n_psi
         shape = (n_groups, n_queries)
 
@@ -171,10 +166,8 @@ def cell_loss(p: torch.Tensor, y: torch.Tensor, weight: Callable[[torch.Tensor],
 
 def relative_loss(p: torch.Tensor, batch: Batch) -> torch.Tensor:
     """Mean of (p - y)² / (p² + p hit), the denominator held fixed; its minimum is unbiased for noisy y.
-
     p hit is the variance of y where few scores have met a cell, so that those cells count by their noise and the others
-    by their relative error.
-    """
+    by their relative error."""
     hit = torch.cat((batch.hit, batch.hit), dim=1)
     return cell_loss(p, batch.y, lambda q: 1 / (q * (q + hit) + 1e-20))
 
@@ -205,11 +198,7 @@ def apply_networks(
 
 class Small(nn.Module):
     """log(G/B) of one medium: `Network` as a torch module.
-
-    Args:
-        seed: of the numbers at the start.
-        start: network to start from instead.
-    """
+    `seed`: of the numbers at the start. `start`: network to start from instead."""
 
     def __init__(self, width: int = 32, depth: int = 3, seed: int = 0, start: Network | None = None) -> None:
         super().__init__()
@@ -276,12 +265,8 @@ class Hyper(nn.Module):
 
 class PaperLearner(nn.Module):
     """S of one medium by a plain perceptron: `NeuralPaper` as a torch module.
-
-    Args:
-        medium: scalar, in mean free paths.
-        scale: S is divided by it, so that targets are of order one.
-        seed: of the numbers at the start.
-    """
+    `medium`: scalar, in mean free paths. `scale`: S is divided by it, so that targets are of order one. `seed`: of the
+    numbers at the start."""
 
     def __init__(self, medium: Medium, scale: float, width: int = 256, depth: int = 3, seed: int = 0) -> None:
         super().__init__()
