@@ -199,16 +199,9 @@ def _scene(p: Params, model: str) -> mi.Scene:
 
 def trained_online(p: Params, folder: Path, seconds: float, train_seconds: float) -> dict[str, object]:
     """The object is learnt and rendered from nothing; weights must not be there.
-
-    Args:
-        p: material, size, lights, seed, train_error and model.
-        folder: for the image and its parts.
-        seconds: in all, about.
-        train_seconds: of them at most for learning.
-
-    Returns:
-        The snapshots, the seconds at the switch, and what `about` tells of the training.
-    """
+    `p`: material, size, lights, seed, train_error and model. `folder`: for the image and its parts. `seconds`: in all,
+    about. `train_seconds`: of them at most for learning. Returns the snapshots, the seconds at the switch, and what
+    `about` tells of the training."""
     result, walks, switch = Snapshots(), [None], [0.0]
 
     def traced(image: Reference) -> None:

@@ -257,17 +257,9 @@ def _converted(name: str, convert: Callable[[object], Real], value: object) -> R
 
 def broadcast_query(*args: Real, names: Sequence[str] = ()) -> tuple[Library, tuple]:
     """The library of a query and its arguments as broadcast floating-point arrays of that library.
-
-    The precision is the widest among the array arguments; Python numbers follow it, and a query of
-    Python numbers only is answered in float64.
-
-    Args:
-        args: of the query.
-        names: of these, for messages.
-
-    Raises:
-        ValueError: the shapes do not broadcast, libraries are mixed, or NumPy has no real numbers, as of text.
-    """
+    The precision is the widest among the array arguments; Python numbers follow it, and a query of Python numbers only
+    is answered in float64. `args`: of the query. `names`: of these, for messages. ValueError if the shapes do not
+    broadcast, libraries are mixed, or NumPy has no real numbers, as of text."""
     lib = library(*args)
     args = _common_float(lib, args, names)
     if isinstance(lib, _DrJitLibrary):

@@ -132,13 +132,9 @@ def write_atomically(path: Path, content: bytes | str) -> None:
 
 def write_together(files: Mapping[Path, bytes | str]) -> None:
     """Write files that belong together: those that are there at any moment are all whole and of the same writing.
-
     All are written under temporary names first, so that a full disk leaves the files of before. In an object store they
-    are written in their order, each whole; readers there compare the checksum that the last one names.
-
-    Raises:
-        OSError: a file cannot be written; the message names it.
-    """
+    are written in their order, each whole; readers there compare the checksum that the last one names. OSError if a
+    file cannot be written; the message names it."""
     if any(map(is_remote, files)):
         for path, content in files.items():
             path.write_bytes(content.encode() if isinstance(content, str) else content)
@@ -241,13 +237,9 @@ _held: set[tuple[Path, int]] = set()
 @contextlib.contextmanager
 def one_writer(path: Path) -> Iterator[None]:
     """Hold the lock of a result, in `.NAME.lock` beside it, while it is written.
-
     The system lets go of the lock when a process ends, however it ends: a lock file that was left by one hinders
-    nobody. What this thread holds already it may hold again. Object stores have no locks.
-
-    Raises:
-        ValueError: another run writes it; the message names its process and computer.
-    """
+    nobody. What this thread holds already it may hold again. Object stores have no locks. ValueError if another run
+    writes it; the message names its process and computer."""
     key = (path.absolute() if not is_remote(path) else Path(), threading.get_ident())
     if is_remote(path) or key in _held:
         yield

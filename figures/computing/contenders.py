@@ -119,12 +119,9 @@ NOTE = (
 
 def reference_image(task: Task, scene: mi.Scene, alone: mi.Scene | None = None) -> dict[str, object]:
     """The path traced image of a scene without its noise, and how far two halves of its samples are apart.
-
-    Args:
-        task: whose parameters "spp" and "seed" are those of the image; what is done of it is kept in its folder.
-        scene: Mitsuba scene with an integrator that traces paths.
-        alone: the scene with nothing but the object, whose pixels count; by default all that is there counts.
-    """
+    `task`: whose parameters "spp" and "seed" are those of the image; what is done of it is kept in its folder. `scene`:
+    Mitsuba scene with an integrator that traces paths. `alone`: the scene with nothing but the object, whose pixels
+    count; by default all that is there counts."""
     check_denoiser()  # before time is spent
     spp = task.params["spp"] // 2
     each = min(SPP_PER_PASS, max(spp // 2, 1))
@@ -170,12 +167,7 @@ def reference_shot(result: Result, label: str = "Path traced") -> tuple[Shot, np
 
 def against(reference: tuple[Shot, np.ndarray, float], label: str, image: np.ndarray, **numbers: float | str) -> Shot:
     """An image beside a reference, exposed alike.
-
-    Args:
-        reference: as `reference_shot` gives it.
-        label: of the model or method.
-        image: linear radiance, not exposed.
-        numbers: further columns.
-    """
+    `reference`: as `reference_shot` gives it. `label`: of the model or method. `image`: linear radiance, not exposed.
+    `numbers`: further columns."""
     shot, mask, stops = reference
     return compared(label, np.float32(2.0**stops) * image, shot.image, mask=mask, numbers=numbers)

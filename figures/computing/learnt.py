@@ -63,13 +63,8 @@ GRID = 0.5  # cells of a medium along an object over cubes of its surface
 
 def train_scan(name: str, material: str, chunks: int, scan: str = "bunny") -> Part:
     """The part in which a scanned object of a material is learnt by so many chunks of data.
-
-    Args:
-        name: of what is learnt, by which `training_of` finds it.
-        material: in the registry.
-        chunks: see `full_geometry.learning.training.train_unattended`.
-        scan: name in `scans.SCANS`.
-    """
+    `name`: of what is learnt, by which `training_of` finds it. `material`: in the registry. `chunks`: see
+    `full_geometry.learning.training.train_unattended`. `scan`: name in `scans.SCANS`."""
     params = {"scan": scan, "material": material, "chunks": chunks, "seed": 0, "model": FULL_GEOMETRY}
     return Part(training_of(name), _scanned, params, chunks, inputs=(SCANS[scan].file,))
 

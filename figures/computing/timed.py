@@ -25,13 +25,9 @@ GROWTH, MOST_TRIALS = 16, 8  # of the number of samples of a pass that is looked
 @dataclass(frozen=True, eq=False)
 class TimedRender:
     """Passes of a scene.
-
-    Attributes:
-        images: of each pass, linear radiance, float32 (passes, H, W, 3).
-        spp: samples per pixel of all together.
-        pass_seconds: of each pass, without compilation.
-        pass_cpu_seconds: of all threads, which other work on the machine does not lengthen.
-    """
+    `images`: of each pass, linear radiance, float32 (passes, H, W, 3). `spp`: samples per pixel of all together.
+    `pass_seconds`: of each pass, without compilation. `pass_cpu_seconds`: of all threads, which other work on the
+    machine does not lengthen."""
 
     images: np.ndarray
     spp: int

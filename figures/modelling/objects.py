@@ -187,15 +187,9 @@ class Grid:
 
 def mixed(tissues: Tissues, box: Box, resolution: int) -> Grid:
     """The medium of shares f_k of tissues: sigma_t = sum f_k sigma_t,k; albedo = sum f_k sigma_t,k albedo_k / sigma_t.
-
-    Args:
-        tissues: of points (n, 3), mm: share of each tissue by name, >= 0, summing to 1.
-        box: that is covered; the grid's box is larger by less than a cell.
-        resolution: cells along the longest side, >= 8.
-
-    Raises:
-        ValueError: the resolution is too small, there is no such tissue, or shares are out of range.
-    """
+    `tissues`: of points (n, 3), mm: share of each tissue by name, >= 0, summing to 1. `box`: that is covered; the
+    grid's box is larger by less than a cell. `resolution`: cells along the longest side, >= 8. ValueError if the
+    resolution is too small, there is no such tissue, or shares are out of range."""
     cell = box.cell(resolution)
     counts = box.counts(cell)
     high = tuple(float(low + cell * n) for low, n in zip(box.low, counts))
@@ -241,16 +235,9 @@ class Varying:
 
 def make_varying(name: str, resolution: int = 192, grid_resolution: int = 160, seed: int = 0) -> Varying:
     """An object whose medium varies.
-
-    Args:
-        name: "mandarin", "meat" or "croissant".
-        resolution: grid cubes of the surface along the longest side of its box, >= 8.
-        grid_resolution: cells of the medium along that side, >= 8.
-        seed: of everything uneven about it.
-
-    Raises:
-        ValueError: no such object, or a resolution is too small.
-    """
+    `name`: "mandarin", "meat" or "croissant". `resolution`: grid cubes of the surface along the longest side of its
+    box, >= 8. `grid_resolution`: cells of the medium along that side, >= 8. `seed`: of everything uneven about it.
+    ValueError if there is no such object, or a resolution is too small."""
     check_choice("object", name, VARYING)
     make, box = _MODELS[name]
     result = make(seed)

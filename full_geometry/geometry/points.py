@@ -38,13 +38,8 @@ if TYPE_CHECKING:
 @dataclass
 class MediumAt:
     """The medium at a point of a surface, per channel, for the whole way of light from there; 1/(scene unit).
-
-    Args:
-        albedo: of single scattering.
-        sigma_t: extinction.
-        face: number of the face there.
-        g, wavelengths: mean cosine and wavelengths in nm, under spectral variants.
-    """
+    `albedo`: of single scattering. `sigma_t`: extinction. `face`: number of the face there. `g`, `wavelengths`: mean
+    cosine and wavelengths in nm, under spectral variants."""
 
     albedo: mi.Spectrum
     sigma_t: mi.Spectrum
@@ -353,14 +348,10 @@ class ObjectAlbedo(Protocol):
 
 
 class Transport(Protocol):
-    """S of one object, for any exit and entry.
-
-    Attributes:
-        orders: "multiple" (two or more scattering events) or "total".
-        checksums: of what it has learnt, which are part of a render's identity; empty where nothing is.
-        alpha: its directional albedo, the control variate of an even sky; None where it is not known.
-        is_delta: whether light leaves where it enters, so that S has no value for two points.
-    """
+    """S of one object, for any exit and entry. `orders`: "multiple" (two or more scattering events) or "total".
+    `checksums`: of what it has learnt, which are part of a render's identity; empty where nothing is. `alpha`: its
+    directional albedo, the control variate of an even sky; None where it is not known. `is_delta`: whether light leaves
+    where it enters, so that S has no value for two points."""
 
     orders: str
     checksums: tuple[str, ...] = ()

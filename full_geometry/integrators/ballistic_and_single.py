@@ -248,13 +248,9 @@ def _scattered_along(
 
 class LightAtEvents(NamedTuple):
     """Light that reaches events without scattering.
-
-    Args:
-        connected: by emitter connections, over the density of the emitter, with its direction; of several ways.
-        left: walks that have left the object, and how many reflections they have met.
-        weight: of them, per unit of the radiance that they meet.
-        unconnected: of that light of emitters, which no connection has found, with the weight.
-    """
+    `connected`: by emitter connections, over the density of the emitter, with its direction; of several ways. `left`:
+    walks that have left the object, and how many reflections they have met. `weight`: of them, per unit of the radiance
+    that they meet. `unconnected`: of that light of emitters, which no connection has found, with the weight."""
 
     connected: list[tuple[mi.Spectrum, mi.Vector3f]]
     left: OneEventWalk

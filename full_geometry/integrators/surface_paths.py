@@ -101,11 +101,9 @@ def trace_paths(
     active: mi.Bool, scattered: bool = False, passes: bool = True,
 ) -> tuple[tuple[mi.Spectrum, mi.Spectrum], mi.Bool, mi.Spectrum]:  # fmt: skip
     """Radiance along a camera ray in two parts for a replay, whether the ray hits anything, and unconnected light.
-
     The second part is light of orders 0 and 1 of the object that the ray meets first. What phase sampling alone has hit
     is in both. `scattered` says whether the ray is one of many that a vertex may have sent, as for a path that goes on,
-    `passes` whether order 0 of the first object counts.
-    """
+    `passes` whether order 0 of the first object counts."""
     # the first pass adds up; L of both its parts begins at 0
     context = RenderContext.of(scene, objects, settings, Primal())
     L, radiance, hit = _loop(context, sampler, ray, (mi.Spectrum(0), mi.Spectrum(0)), (), active, scattered, passes)
@@ -707,11 +705,9 @@ def resample_entry(
     active: mi.Bool,
 ) -> Candidate:
     """One entry for light that leaves at `out`, by resampled importance sampling (Talbot, Cline and Egbert 2005).
-
     One of N candidates with weights W_k = S mu_i / density is kept with the probability w_k / Σ w, with w_k the
     resampling target: the largest channel of W_k times the light of a sampled emitter. Its weight is W_k Σ w / (N w_k),
-    the mean of all candidates. The ray that goes on tests the visibility of the one kept.
-    """
+    the mean of all candidates. The ray that goes on tests the visibility of the one kept."""
     # ---- what transport and proposals make of the exit once, for all candidates
     with dr.suspend_grad():
         prepared = obj.transport.prepare(out, active)

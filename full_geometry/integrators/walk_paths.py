@@ -338,14 +338,9 @@ class LightVisitor:
         self, walk: Walk, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32, active: mi.Bool, through: mi.Bool
     ) -> tuple[Seen, Seen]:
         """What object k mirrors, and what is seen through it; added whatever is chosen, it must not count again.
-
         Only where light inside is precomputed: beside light that is met by chance, of an even sky above all, the choice
-        between both sides of the boundary has less noise.
-
-        Args:
-            active: whether emitters are looked for.
-            through: the same behind the object; where a path has scattered, the cones of delta lights are met there.
-        """
+        between both sides of the boundary has less noise. `active`: whether emitters are looked for. `through`: the
+        same behind the object; where a path has scattered, the cones of delta lights are met there."""
         none = Seen(mi.Spectrum(0), mi.Bool(False), mi.Spectrum(1))
         if self.unscattered is None:
             return none, none

@@ -496,16 +496,9 @@ TRIES = 8
 
 def make_shape(family: str, seed: int, resolution: int = 48, families: Mapping[str, Family] = TRAINING) -> Mesh:
     """A random shape of a family.
-
-    Args:
-        family: its name in `families`.
-        seed: whole number >= 0.
-        resolution: grid cubes along its longest side, >= 8.
-        families: generators by name.
-
-    Raises:
-        ValueError: an argument is out of range, or no shape of that family came out in eight tries.
-    """
+    `family`: its name in `families`. `seed`: whole number >= 0. `resolution`: grid cubes along its longest side, >= 8.
+    `families`: generators by name. ValueError if an argument is out of range, or no shape of that family came out in
+    eight tries."""
     check_choice("family", family, tuple(families))
     check_count("seed", seed, 0)
     check_count("resolution", resolution, 8)

@@ -185,13 +185,8 @@ def measure(
     seed: int = 0,
 ) -> list[RadianceError]:
     """The error of a transport of an object, per channel, under constant light and lobes.
-
-    Args:
-        transport: its S.
-        proposals: where entries are drawn.
-        truth: from `reference`, of the orders of the transport; made anew by default.
-        samples: entries of each exit.
-    """
+    `transport`: its S. `proposals`: where entries are drawn. `truth`: from `reference`, of the orders of the transport;
+    made anew by default. `samples`: entries of each exit."""
     check_count("samples", samples, 2)
     truth = truth or reference(obj, seed=seed, fewest=FEWEST[transport.orders])
     return compare(modelled(transport, proposals, truth.exits, samples, seed), truth.truth)
@@ -218,15 +213,9 @@ def errors_of(
     progress: NamedProgress | None = None,
 ) -> dict[str, list[RadianceError]]:
     """The errors of several transports of an object, by name; the truth is traced once for all of the same orders.
-
-    Those that have learnt what uniform light leaves have the error of images under an even sky too.
-
-    Args:
-        transports: by name.
-        exits, seed: number of exits; of everything.
-        walks, samples: of each exit, for the truth and for the models.
-        progress: called with (what, done, total).
-    """
+    Those that have learnt what uniform light leaves have the error of images under an even sky too. `transports`: by
+    name. `exits`, `seed`: number of exits; of everything. `walks`, `samples`: of each exit, for the truth and for the
+    models. `progress`: called with (what, done, total)."""
     check_count("samples", samples, 2)
     proposals = EntryProposals(obj, HalfSpace(obj, PROBES))
     truths: dict[str, ExitTruth] = {}

@@ -297,14 +297,9 @@ class ObjectFit:
 
     def use(self, walks: Pairs, proposals: Pairs, steps: int | None, order: np.random.Generator) -> None:
         """Steps on all batches of a chunk, `reuse` times over, every other time with exit and entry exchanged.
-
-        As S is reciprocal and exits are drawn by area and cosine, a pair read backwards is as good a sample.
-
-        Args:
-            walks, proposals: the chunk.
-            steps: of the whole fit, for the decay of the rate; None for no decay.
-            order: of the batches, in which walks meet other proposals each time, and of the proposals that are used.
-        """
+        As S is reciprocal and exits are drawn by area and cosine, a pair read backwards is as good a sample. `walks`,
+        `proposals`: the chunk. `steps`: of the whole fit, for the decay of the rate; None for no decay. `order`: of the
+        batches, in which walks meet other proposals each time, and of the proposals that are used."""
         batch = self.recipe.batch
         x, T = (self._tensor(v) for v in (walks.features, walks.values))
         y, W = self._worthy(proposals, order)

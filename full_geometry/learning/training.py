@@ -63,13 +63,8 @@ def trusted(
     model: FullGeometry, truth: ExitTruth, errors: list[RadianceError], walks: int, seed: tuple[int, ...]
 ) -> np.ndarray:
     """1 where the directional albedo may be used and 0 where not, (2, channels): orders below two, then the others.
-
-    Args:
-        model: S and alpha.
-        truth: exits and walks of orders from two on.
-        errors: of S there.
-        walks: of each exit, for order one.
-    """
+    `model`: S and alpha. `truth`: exits and walks of orders from two on. `errors`: of S there. `walks`: of each exit,
+    for order one."""
     once = traced(model.object, truth.exits, walks, seed, fewest=1, most=1)
     parts = model.alpha.parts(truth.exits)
     dr.eval(parts)
@@ -300,12 +295,9 @@ def train_unattended(
     recipe: Recipe = STANDARD,
 ) -> Trained:
     """Learn an object without errors on the way, in seconds of CPU time whatever else the machine does, or by chunks.
-
-    Args:
-        cpu_seconds: of this process, for data and fit; errors at the end take more.
-        chunks: instead, each of `recipe.chunk` walks that are kept, so that the clock has no part in the weights.
-        seed, recipe: of everything; sizes and rates.
-    """
+    `cpu_seconds`: of this process, for data and fit; errors at the end take more. `chunks`: instead, each of
+    `recipe.chunk` walks that are kept, so that the clock has no part in the weights. `seed`, `recipe`: of everything;
+    sizes and rates."""
     if chunks is None:
         check_interval("cpu_seconds", cpu_seconds, 1e-3, 1e7)
     else:

@@ -93,13 +93,8 @@ def find_inclusions(scene: mi.Scene, objects: list[Geometry]) -> list[Inclusion]
 
 class _Pairs(NamedTuple):
     """Copies i of a shape and j of an object whose boxes meet.
-
-    Args:
-        i, j: arrays (n,).
-        thing, holder: arrays (n, 4, 4), their places.
-        low, high: arrays (n, 3), the box that they share.
-        deep: array (n,), the depth from which on a shape lies inside, scene units.
-    """
+    `i`, `j`: arrays (n,). `thing`, `holder`: arrays (n, 4, 4), their places. `low`, `high`: arrays (n, 3), the box that
+    they share. `deep`: array (n,), the depth from which on a shape lies inside, scene units."""
 
     i: np.ndarray
     j: np.ndarray

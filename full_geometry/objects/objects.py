@@ -66,13 +66,9 @@ from halfspace_sss.registry import bssrdf
 @dataclass(frozen=True, eq=False)
 class Inclusions:
     """The inclusions of one object, for a transport that takes them.
-
-    Args:
-        found: shapes that neither emit nor reach out of the object, those inside each other too.
-        scene: a scene that holds these only.
-        specs: the `MediumSpec` of each, 1/(scene unit); None of a surface that is not translucent.
-        surfaces: of each the BSDF as it is.
-    """
+    `found`: shapes that neither emit nor reach out of the object, those inside each other too. `scene`: a scene that
+    holds these only. `specs`: the `MediumSpec` of each, 1/(scene unit); None of a surface that is not translucent.
+    `surfaces`: of each the BSDF as it is."""
 
     found: list[Inclusion]
     scene: mi.Scene

@@ -127,13 +127,8 @@ def read_layers(text: str) -> tuple[tuple[Medium, ...], tuple[float, ...]]:
 @dataclass(frozen=True, eq=False)
 class Depths:
     """Depths below the surface of an object, on a grid.
-
-    Args:
-        texture: of the depths, in scene units.
-        low: the first node.
-        per_unit: texture coordinates per scene unit along each axis.
-        half: half a texel of each axis.
-    """
+    `texture`: of the depths, in scene units. `low`: the first node. `per_unit`: texture coordinates per scene unit
+    along each axis. `half`: half a texel of each axis."""
 
     texture: mi.Texture3f
     low: np.ndarray

@@ -60,13 +60,9 @@ class Stencil:
 
 class MediumDerivatives:
     """Derivatives of S of one object by the parameters of its surface.
-
-    Args:
-        surface: its `translucent` BSDF, whose parameters are differentiated by.
-        mm_per_unit: length of a scene unit, mm.
-        model: name of the object's model.
-        plane: name of the half-space model that knows the same media; "" where the model has no derivatives by them.
-    """
+    `surface`: its `translucent` BSDF, whose parameters are differentiated by. `mm_per_unit`: length of a scene unit,
+    mm. `model`: name of the object's model. `plane`: name of the half-space model that knows the same media; "" where
+    the model has no derivatives by them."""
 
     def __init__(self, surface: mi.BSDF, mm_per_unit: float, model: str, plane: str) -> None:
         self.surface, self.spec, self.mm_per_unit = surface, surface.spec, mm_per_unit

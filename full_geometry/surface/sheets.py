@@ -79,16 +79,8 @@ def _tensor(values: list[np.ndarray]) -> mi.TensorXf:
 
 class Sheet:
     """What a slab does to light, for one direction or two, by channel.
-
-    Args:
-        medium: with a value for each channel, 1/mm.
-        textured: its albedo over the surface, or None.
-        thickness: mm.
-        reflects: whether the boundary mirrors from outside.
-
-    Raises:
-        ValueError: g or the optical thickness is out of range.
-    """
+    `medium`: with a value for each channel, 1/mm. `textured`: its albedo over the surface, or None. `thickness`: mm.
+    `reflects`: whether the boundary mirrors from outside. ValueError if g or the optical thickness is out of range."""
 
     def __init__(self, medium: Medium, textured: TexturedMedium | None, thickness: float, reflects: bool) -> None:
         self.eta, self.textured, self.reflects = float(medium.eta), textured, reflects
@@ -178,13 +170,8 @@ class Sheet:
 
     def sample(self, si: mi.SurfaceInteraction3f, turned: mi.Float, u: mi.Point2f, ahead: mi.Float) -> mi.Vector3f:
         """A direction of scattered light.
-
-        Args:
-            si: where, with wi.
-            turned: uniform number, which chooses between a cosine and the phase function.
-            u: uniform numbers.
-            ahead: share of the other side.
-        """
+        `si`: where, with wi. `turned`: uniform number, which chooses between a cosine and the phase function. `u`:
+        uniform numbers. `ahead`: share of the other side."""
         share = self.once
         by_phase, v = turned < share, (turned - share) / dr.maximum(1 - share, 1e-6)
         flat = mi.warp.square_to_cosine_hemisphere(u)

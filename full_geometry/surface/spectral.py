@@ -116,17 +116,9 @@ def _grid(first: float, last: float) -> np.ndarray:
 
 def spectral_medium(props: mi.Properties, keys: tuple[str, ...]) -> tuple[dict[str, Any], np.ndarray | None]:
     """Coefficients of the parameters of a surface by wavelength; numbers, if all of them are.
-
-    Args:
-        props: the parameters; numbers, spectra of Mitsuba, and rgb where that is an albedo or a reflectance.
-        keys: their names.
-
-    Returns:
-        The values, arrays where wavelengths are given, and these in nm, which all the spectra cover.
-
-    Raises:
-        ValueError: a parameter is neither, or spectra do not overlap.
-    """
+    `props`: the parameters; numbers, spectra of Mitsuba, and rgb where that is an albedo or a reflectance. `keys`:
+    their names. Returns the values, arrays where wavelengths are given, and these in nm, which all the spectra cover.
+    ValueError if a parameter is neither, or spectra do not overlap."""
     given = {key: _number_or_texture(props, key) for key in keys if key in props}
     textures = {key: value for key, value in given.items() if isinstance(value, mi.Texture)}
     if not textures:

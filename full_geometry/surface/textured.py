@@ -87,13 +87,7 @@ def bend(g: float) -> float:
 
 def x_of_albedo(lib: ModuleType, albedo: Number, g: Number, c: Number) -> Number:
     """x of `physics.reflectance`: 0 for albedo 1, 1 for albedo 0.
-
-    Args:
-        lib: NumPy or Dr.Jit.
-        albedo: of single scattering.
-        g: mean cosine.
-        c: from `bend`.
-    """
+    `lib`: NumPy or Dr.Jit. `albedo`: of single scattering. `g`: mean cosine. `c`: from `bend`."""
     s = lib.sqrt((1 - albedo) / (1 - g * albedo))
     return s * c / (1 - (1 - c) * s)
 
@@ -225,14 +219,9 @@ class TexturedMedium:
 
     def check(self, obj: Geometry | None = None) -> None:
         """Refuse textures that are no medium's, and warn of colours that no medium has, which are clipped.
-
-        Args:
-            obj: the object they are on, whose uv and attributes they need; without it their texels are looked at.
-
-        Raises:
-            ValueError: texels are not finite, of albedo or reflectance outside [0, 1], of sigma_t or mfp not > 0; or
-                the mesh of the object has no uv, or not the attribute.
-        """
+        `obj`: the object they are on, whose uv and attributes they need; without it their texels are looked at.
+        ValueError if texels are not finite, of albedo or reflectance outside [0, 1], of sigma_t or mfp not > 0; or the
+        mesh of the object has no uv, or not the attribute."""
         for name, texture in self.textures.items():
             values, hint = texels(texture), ""
             if obj is not None:
@@ -385,16 +374,9 @@ def check_values(name: str, values: np.ndarray, hint: str = "") -> None:
 
 def textured_medium(values: dict[str, Any], g: np.ndarray | float, eta: float, channels: int) -> TexturedMedium:
     """The medium of parameters with at least one texture.
-
-    Args:
-        values: `albedo` and `sigma_t`, with or without `scale`, or `reflectance` and `mfp`; textures, or numbers.
-        g: a number or one per channel.
-        eta: relative index.
-        channels: of the variant.
-
-    Raises:
-        ValueError: a number is out of range, or as `TexturedMedium.check`.
-    """
+    `values`: `albedo` and `sigma_t`, with or without `scale`, or `reflectance` and `mfp`; textures, or numbers. `g`: a
+    number or one per channel. `eta`: relative index. `channels`: of the variant. ValueError if a number is out of
+    range, or as `TexturedMedium.check`."""
     if not isinstance(values.get("mfp", 1.0), mi.Texture):
         values = {name: diffuse_limit(value) if name == "mfp" else value for name, value in values.items()}
     for name, value in values.items():

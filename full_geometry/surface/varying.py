@@ -26,13 +26,9 @@ Coefficient = "mi.Volume | np.ndarray | float"
 @dataclass(frozen=True, eq=False)
 class VaryingMedium:
     """Extinction and albedo of a medium that varies in space.
-
-    Args:
-        density: the volume D >= 0, with one channel or one per channel of the variant; None for one everywhere.
-        factor: 1/mm, one value per channel, >= 0.
-        albedo_volume: the volume A, likewise.
-        albedo: one value per channel; albedo A is in [0, 1].
-    """
+    `density`: the volume D >= 0, with one channel or one per channel of the variant; None for one everywhere. `factor`:
+    1/mm, one value per channel, >= 0. `albedo_volume`: the volume A, likewise. `albedo`: one value per channel; albedo
+    A is in [0, 1]."""
 
     density: mi.Volume | None
     factor: np.ndarray

@@ -73,13 +73,8 @@ class Wrapping:
 
     def draw(self, si: mi.SurfaceInteraction3f, behind: mi.Bool, u: mi.Float, active: mi.Bool) -> mi.BSDFPtr:
         """The BSDF that a ray from outside meets at a point of the surface.
-
-        Args:
-            si: the point.
-            behind: whether the ray, let in by a mask, arrives from inside.
-            u: uniform number.
-            active: mask of lanes.
-        """
+        `si`: the point. `behind`: whether the ray, let in by a mask, arrives from inside. `u`: uniform number.
+        `active`: mask of lanes."""
         drawn, going = mi.BSDFPtr(self.surface), mi.Bool(active)
         for mix in self.mixes:
             share = mix.share(si, going)

@@ -90,15 +90,9 @@ def relative_mse(
     reference: np.ndarray, test: np.ndarray, *, mask: np.ndarray | None = None, floor: float = 0.01
 ) -> Difference:
     """Relative squared error (test - reference)² / (reference² + floor) of linear images, mean of the channels.
-
-    Args:
-        reference, test: linear radiance (H, W, 3), finite and >= 0.
-        mask: (H, W), true where a pixel counts for the mean; the map covers all.
-        floor: squared radiance, > 0; keeps black pixels from deciding the mean.
-
-    Raises:
-        ValueError: an argument is out of range.
-    """
+    `reference`, `test`: linear radiance (H, W, 3), finite and >= 0. `mask`: (H, W), true where a pixel counts for the
+    mean; the map covers all. `floor`: squared radiance, > 0; keeps black pixels from deciding the mean. ValueError if
+    an argument is out of range."""
     reference, test, inside = _checked(reference, test, mask)
     check_interval("floor", floor, 1e-12, 1e12)
     a, b = reference.astype(np.float64), test.astype(np.float64)

@@ -290,13 +290,8 @@ PAGE_SIDE = 128  # of the images of the page
 @dataclass(frozen=True, eq=False)
 class TradePicture:
     """A trade to be drawn.
-
-    Args:
-        found: what was measured.
-        tolerance: that was asked.
-        sentences: of the recommendation.
-        images: linear radiance (H, W, 3) by name of the way, path traced first.
-    """
+    `found`: what was measured. `tolerance`: that was asked. `sentences`: of the recommendation. `images`: linear
+    radiance (H, W, 3) by name of the way, path traced first."""
 
     title: str
     found: Assessment
@@ -309,13 +304,8 @@ def picture_of(
     file: Path, assessment: Assessment, tolerance: float, sentences: Sequence[str], how: Mapping[str, Any]
 ) -> TradePicture:
     """The picture of a recommendation for a scene file, whose images are rendered for it.
-
-    Args:
-        assessment: what was measured.
-        tolerance: that was asked.
-        sentences: of the recommendation.
-        how: sensor, seed and parameters, as for `assess`.
-    """
+    `assessment`: what was measured. `tolerance`: that was asked. `sentences`: of the recommendation. `how`: sensor,
+    seed and parameters, as for `assess`."""
     names = dict.fromkeys(w.way for o in assessment.objects for w in o.ways if not w.refusal)
     images: Mapping[str, np.ndarray] = {}
     if names:

@@ -156,13 +156,8 @@ class EntryProposals:
         self, exit: SurfacePoint, rng: mi.PCG32, table: WeightTable | None = None, k: mi.UInt32 | int = 0
     ) -> tuple[SurfacePoint, mi.Float]:
         """An entry for each exit, and mu_i over its density; 0 where none was found.
-
-        Args:
-            exit: points of the surface.
-            rng: generator of as many lanes.
-            table: of weights of patches, which are asked of the network otherwise.
-            k: of each exit, its number in the table.
-        """
+        `exit`: points of the surface. `rng`: generator of as many lanes. `table`: of weights of patches, which are
+        asked of the network otherwise. `k`: of each exit, its number in the table."""
         out = exit._replace(sign=opaque(self.object.geometry.sign))
         known = (out, mi.UInt32(k))
         if self.patches is None:

@@ -162,14 +162,9 @@ def check_turns(geometry: Geometry, media: Sequence[Medium], model: str) -> None
 
 def straight_share(geometry: Geometry, media: Sequence[Medium]) -> np.ndarray:
     """Share of even light that passes an object on its first way inside, for the medium of each channel.
-
     The mean of exp(-sigma_t' s) over ways s of light from everywhere, refracted where it enters. The reduced extinction
     sigma_t' = sigma_t - max(g, 0) sigma_s counts forward scattering as none. It is 0 where nothing ends a way, as in a
-    plane.
-
-    Args:
-        geometry, media: as of `check_turns`.
-    """
+    plane. `geometry`, `media`: as of `check_turns`."""
     entered = lines_through(geometry.scene.bbox(), LINES)
     flags = mi.RayFlags.Minimal
     met = meet_alone(geometry.scene, entered, flags)

@@ -43,14 +43,9 @@ FLOOR = 1e-2  # reflectance of the floor, over that of the half-space
 
 class HalfSpace:
     """S_0 P_o P_i per channel, S_0 the model of the plane plus a floor that does not depend on the positions.
-
-    Where media have textures S_0 is that of the medium of the exit, and the floor a share of its reflectance.
-
-    Args:
-        model: name of a half-space model.
-        floor: reflectance of the floor, over that of the half-space.
-        precise: the model is asked `in_double`, for differences.
-    """
+    Where media have textures S_0 is that of the medium of the exit, and the floor a share of its reflectance. `model`:
+    name of a half-space model. `floor`: reflectance of the floor, over that of the half-space. `precise`: the model is
+    asked `in_double`, for differences."""
 
     def __init__(self, obj: TranslucentObject, model: str, floor: float = FLOOR, precise: bool = False) -> None:
         self.object, self.name, self.floor, self.precise = obj, model, floor, precise

@@ -219,15 +219,9 @@ def make_objects(
     scene: mi.Scene, settings: Settings, chosen: Choices | None = None, without: Collection[str] = ()
 ) -> list[TranslucentObject]:
     """All objects of a scene that have a `translucent` surface, but for those in others or with the ids in `without`.
-
-    Args:
-        chosen: what stands for "auto"; may be left out where no object has that model.
-        without: ids.
-
-    Raises:
-        ValueError: there is none, a camera or a lamp is inside one, a model refuses its medium or what lies inside, or
-            the orders that are asked for are not those of the model.
-    """
+    `chosen`: what stands for "auto"; may be left out where no object has that model. `without`: ids. ValueError if
+    there is none, a camera or a lamp is inside one, a model refuses its medium or what lies inside, or the orders that
+    are asked for are not those of the model."""
     if mi.is_spectral and settings.light != "sampled":
         raise ValueError(f"light must be 'sampled' under a spectral variant, got {settings.light!r}")
     shapes = translucent_shapes(scene)

@@ -180,20 +180,9 @@ class LiveScene:
 
     def save(self, name: str, way: Way, camera: Camera, edits: Edits) -> str:
         """Write the scene as it is into its folder, as a new file or over one that `save` has written.
-
-        Args:
-            name: of the file, without folders.
-            way: becomes its integrator.
-            camera: becomes its first sensor.
-            edits: what is changed.
-
-        Returns:
-            The command that renders it.
-
-        Raises:
-            ValueError: the name has a folder, does not end in .xml, or is the one of the scene that is looked at; or
-                that is a glTF file.
-        """
+        `name`: of the file, without folders. `way`: becomes its integrator. `camera`: becomes its first sensor.
+        `edits`: what is changed. Returns the command that renders it. ValueError if the name has a folder, does not end
+        in .xml, or is the one of the scene that is looked at; or that is a glTF file."""
         path = self.folder / name
         if Path(name).name != name or path.suffix != ".xml" or path == self.file:
             raise ValueError(f"name must be of a new .xml file beside the scene, without folders, got {name!r}")

@@ -337,13 +337,8 @@ class Departure:
 @dataclass(frozen=True, eq=False)
 class EmitterDirections:
     """Directions from events to small emitters.
-
-    Args:
-        scene: the Mitsuba scene.
-        media: its translucent objects.
-        small: its small emitters.
-        scored: whether light comes with its slopes.
-    """
+    `scene`: the Mitsuba scene. `media`: its translucent objects. `small`: its small emitters. `scored`: whether light
+    comes with its slopes."""
 
     scene: mi.Scene
     media: WalkMedia
@@ -454,13 +449,8 @@ CONE = 0.15  # radius of the cone, radians; light that a medium scatters beside 
 @dataclass(frozen=True, eq=False)
 class InnerLights:
     """The delta lights inside objects.
-
-    Args:
-        media: the objects.
-        emitters: the lights.
-        tables: of each, what Dr.Jit's registry calls it, `pointer`, and the object `around` it.
-        blur: scale of the cone; 0 leaves its light out.
-    """
+    `media`: the objects. `emitters`: the lights. `tables`: of each, what Dr.Jit's registry calls it, `pointer`, and the
+    object `around` it. `blur`: scale of the cone; 0 leaves its light out."""
 
     media: WalkMedia
     emitters: list[mi.Emitter]

@@ -47,14 +47,10 @@ class Meeting(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Priorities:
-    """The things of a scene that overlap, or have a priority, in groups.
-
-    Args:
-        instance_table: numbers of objects, then of glass.
-        tables: by these numbers the `bit` of a member, 0 of others, the `first` row of its group and of its `boundary`;
-            by row of a group the `object` of a member; by row of a boundary the number of its `bsdf` in the registry.
-        boundaries: these BSDFs: of a member behind nothing, and behind each of its group.
-    """
+    """The things of a scene that overlap, or have a priority, in groups. `instance_table`: numbers of objects, then of
+    glass. `tables`: by these numbers the `bit` of a member, 0 of others, the `first` row of its group and of its
+    `boundary`; by row of a group the `object` of a member; by row of a boundary the number of its `bsdf` in the
+    registry. `boundaries`: these BSDFs: of a member behind nothing, and behind each of its group."""
 
     instance_table: InstanceTable
     tables: dict[str, mi.UInt32 | mi.Int32]

@@ -448,13 +448,8 @@ def on_device(number: int) -> int:
 
 class WalkExits(NamedTuple):
     """Where walks leave, in the order of their starts.
-
-    Args:
-        at: x_i and w_i.
-        T: throughput; 0 where the walk ended inside or left at an order that is not kept.
-        order: scattering events.
-        face: of the mesh, at x_i.
-    """
+    `at`: x_i and w_i. `T`: throughput; 0 where the walk ended inside or left at an order that is not kept. `order`:
+    scattering events. `face`: of the mesh, at x_i."""
 
     at: SurfacePoint
     T: mi.Spectrum

@@ -263,15 +263,10 @@ TAIL_MASS = 1e-4  # least probability of the power-law tail, so that no distance
 
 
 class RadialSampler:
-    """Piecewise density over r in mean free paths, exact to sample and to evaluate.
-
-    Cells are uniform in log r below the radius where r² R(r) has died out; within a cell r is uniform, so
-    the density over the plane is P_k / (2 pi r (r_{k+1} - r_k)). Beyond the last edge r_max the tail follows
-    r_max / r², which covers the plane also where a profile falls as r⁻³ (no absorption).
-
-    Args:
-        S: `BSSRDF.eval` of a model of a scalar medium with sigma_t = 1.
-    """
+    """Piecewise density over r in mean free paths, exact to sample and to evaluate. Cells are uniform in log r below
+    the radius where r² R(r) has died out; within a cell r is uniform, so the density over the plane is P_k / (2 pi r
+    (r_{k+1} - r_k)). Beyond the last edge r_max the tail follows r_max / r², which covers the plane also where a
+    profile falls as r⁻³ (no absorption). `S`: `BSSRDF.eval` of a model of a scalar medium with sigma_t = 1."""
 
     def __init__(self, S: Callable[..., Real], n_cells: int = 256) -> None:
         r = np.geomspace(R_MIN, R_MAX, 2 * n_cells)
@@ -327,11 +322,9 @@ PROBE = 64  # queries
 
 def recorded_in_blocks(lib: Library, f: Callable[..., Real], args: tuple) -> Real:
     """f(*args), a function of each query alone, so that torch keeps the arguments for its derivatives and no more.
-
     torch keeps what every operation was given, tens of kB a query where a model integrates. Queries that would exceed
     `BLOCK_BYTES` are therefore split, and each block is recorded when it is gone through backwards. Other libraries,
-    and what is not differentiated or depends on further tensors that are, are answered at once.
-    """
+    and what is not differentiated or depends on further tensors that are, are answered at once."""
     if not _recorded(lib, args):
         return f(*args)
     torch, shape = lib.torch, args[0].shape

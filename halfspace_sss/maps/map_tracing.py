@@ -167,14 +167,10 @@ def _launches(paths: int) -> list[tuple[int, int]]:
 
 
 def trace_unit(unit: MapUnit) -> UnitResult:
-    """Trace the maps of one direction of incidence.
-
-    With a target error a pilot of 131072 walks a group tells how many more are needed. The mean cell error is
-    the standard error of a cell weighted by the flux it should carry:
-    sum(standard error mu_o area) / sum(S mu_o area) over all cells of all observations.
-
-    The result depends on the unit alone, not on what ran before: units can be traced anywhere, in any order.
-    """
+    """Trace the maps of one direction of incidence. With a target error a pilot of 131072 walks a group tells how many
+    more are needed. The mean cell error is the standard error of a cell weighted by the flux it should carry:
+    sum(standard error mu_o area) / sum(S mu_o area) over all cells of all observations. The result depends on the unit
+    alone, not on what ran before: units can be traced anywhere, in any order."""
     started = time.perf_counter()
     pilot = unit.n_paths if unit.target_error is None else min(unit.n_paths, PILOT_LANES * PILOT_PATHS)
     groups = unit.grid.n_phi // GROUP

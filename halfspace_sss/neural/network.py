@@ -219,15 +219,10 @@ N_TERMS = N_POLYNOMIALS + len(GRAZING)
 
 
 def log_calibration(c: Sequence[Real], mu: Real, mu_in: Real) -> Real:
-    """log a = sum_k c_k T_k(2 mu - 1) + sum_j d_j s_j / (s_j + mu'); 0 for no terms.
-
-    The polynomials, by Clenshaw's recurrence, are of the outside cosine. The others, s_j of `GRAZING`, are of that
-    inside, mu': where the boundary is nearly matched the network is off for light that runs along it inside.
-
-    Args:
-        c: coefficients c_k and d_j of a medium, numbers or arrays of the library of mu.
-        mu, mu_in: cosines outside and inside, [0, 1].
-    """
+    """log a = sum_k c_k T_k(2 mu - 1) + sum_j d_j s_j / (s_j + mu'); 0 for no terms. The polynomials, by Clenshaw's
+    recurrence, are of the outside cosine. The others, s_j of `GRAZING`, are of that inside, mu': where the boundary is
+    nearly matched the network is off for light that runs along it inside. `c`: coefficients c_k and d_j of a medium,
+    numbers or arrays of the library of mu. `mu`, `mu_in`: cosines outside and inside, [0, 1]."""
     if not len(c):
         return 0.0 * mu
     twice, after, last = 4 * mu - 2, 0.0, 0.0 * mu

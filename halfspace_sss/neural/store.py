@@ -59,16 +59,9 @@ def record_number(path: Path, record: JsonDict, key: str, low: float, high: floa
 
 def save_weights(path: str | os.PathLike, kind: str, arrays: Mapping[str, np.ndarray], record: JsonDict) -> Path:
     """Write `path` (.safetensors) and its record (.json); together or not at all.
-
-    Args:
-        kind: which network it is, e.g. "neural_material".
-        arrays: name -> float array.
-        record: what else is known: medium, architecture, data, error, time, versions; ready for JSON.
-
-    Raises:
-        ValueError: the name does not end in .safetensors, or a number is such that loading would refuse it, which is
-            what a training that diverged gives.
-    """
+    `kind`: which network it is, e.g. "neural_material". `arrays`: name -> float array. `record`: what else is known:
+    medium, architecture, data, error, time, versions; ready for JSON. ValueError if the name does not end in
+    .safetensors, or a number is such that loading would refuse it, which is what a training that diverged gives."""
     from safetensors.numpy import save
 
     path = path_of(path)

@@ -125,11 +125,9 @@ class RingTally(Tally):
 
 class LineTally(Tally):
     """Radiance of order >= 2 towards one outside direction, over cells of a sector about a line from the origin.
-
-    Cells are ring segments between consecutive radii within `half_width` radians of the azimuth `line_phi`.
-    Where the mirror y -> -y changes nothing (w_o in the plane of incidence) the mirrored sector counts too,
-    where rotation changes nothing (both directions normal) the whole ring.
-    """
+    Cells are ring segments between consecutive radii within `half_width` radians of the azimuth `line_phi`. Where the
+    mirror y -> -y changes nothing (w_o in the plane of incidence) the mirrored sector counts too, where rotation
+    changes nothing (both directions normal) the whole ring."""
 
     def __init__(
         self, types: ModuleType, angular: AngularTally, edges: np.ndarray, line_phi: float, half_width: float,

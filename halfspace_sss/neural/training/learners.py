@@ -221,13 +221,9 @@ class Small(nn.Module):
 
 class Hyper(nn.Module):
     """log(G/B) of any medium: `Hypernetwork` as a torch module.
-
-    Args:
-        width, depth: hidden layers of the small network it writes.
-        rank: number of coefficients of a medium.
-        medium_width: hidden units of the network of the medium, which has two hidden layers.
-        seed: of the numbers at the start.
-    """
+    `width`, `depth`: hidden layers of the small network it writes. `rank`: number of coefficients of a medium.
+    `medium_width`: hidden units of the network of the medium, which has two hidden layers. `seed`: of the numbers at
+    the start."""
 
     def __init__(
         self, width: int = 32, depth: int = 3, rank: int = 48, medium_width: int = 64, seed: int = 0
