@@ -263,11 +263,7 @@ def plan(name: str, quality: str, out: str | Path) -> Plan:
 
 
 def compute(
-    name: str,
-    quality: str,
-    out: str | Path,
-    progress: ProgressText | None = None,
-    executor: Executor | None = None,
+    name: str, quality: str, out: str | Path, progress: ProgressText | None = None, executor: Executor | None = None
 ) -> dict[str, Result]:
     """Compute what is missing, damaged or changed of a figure; finished parts survive an interruption.
 

@@ -38,8 +38,7 @@ class UntilOptions:
     """What ends a render: whichever comes first."""
 
     spp: Annotated[
-        int | None,
-        typer.Option(help="Samples for each pixel.", parser=shared.whole, show_default="64, or another end"),
+        int | None, typer.Option(help="Samples for each pixel.", parser=shared.whole, show_default="64, or another end")
     ] = None
     target_error: Annotated[
         float | None,

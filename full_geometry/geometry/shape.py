@@ -91,8 +91,7 @@ def face_normals_agree(shape: mi.Shape, faces: Faces, name: str) -> None:
             mesh.set_vertex_normals(shape, _vertex_normals(positions, vertex, normals))
             more = ", and vertex normals were made anew"
     warnings.warn(
-        f"faces of object {name} point to both sides: {turned} of {len(faces.sides)} were turned{more}",
-        stacklevel=3,
+        f"faces of object {name} point to both sides: {turned} of {len(faces.sides)} were turned{more}", stacklevel=3
     )
 
 

@@ -19,13 +19,7 @@ import mitsuba as mi
 from full_geometry.geometry.points import EntrySample, SurfacePoint, lifted, opaque, place, turned
 from full_geometry.geometry.rounding import blocked, ray_from, ray_to
 from full_geometry.integrators.ballistic_and_single import RefractedRay, sample_one_event
-from full_geometry.integrators.lighting import (
-    PathRadiance,
-    Primal,
-    RenderContext,
-    Replay,
-    delta_light,
-)
+from full_geometry.integrators.lighting import PathRadiance, Primal, RenderContext, Replay, delta_light
 from full_geometry.integrators.specular_connections import outward_sign
 from full_geometry.objects.objects import TranslucentObject
 from full_geometry.settings import Settings

@@ -24,12 +24,7 @@ from full_geometry.precomputed.forward_scattering import ForwardRun
 from full_geometry.precomputed.scattered_light import FEW, ONWARD
 from full_geometry.precomputed.unscattered_light import UnscatteredLight
 from full_geometry.walk.emission import emission, emitter_pdf, mis_weight, next_event, survival
-from full_geometry.walk.emitter_connections import (
-    Departure,
-    EmitterDirections,
-    InnerLights,
-    SubpathConnections,
-)
+from full_geometry.walk.emitter_connections import Departure, EmitterDirections, InnerLights, SubpathConnections
 from full_geometry.walk.media import WalkMedia, WalkMedium, interaction_of, ray_of
 from full_geometry.walk.random_walk import (
     OUTSIDE,

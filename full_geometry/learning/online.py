@@ -247,11 +247,7 @@ def combined(walks: Reference, model: Reference) -> Reference:
     for to, of in ((white, ~white), (~white, white)):
         share[to] = _share(walks, model, np.where(of, tiles, -1))
     s = share[..., None]
-    about = {
-        "share_of_walks": float(share.mean()),
-        "walks": _told(walks),
-        "model": _told(model),
-    }
+    about = {"share_of_walks": float(share.mean()), "walks": _told(walks), "model": _told(model)}
     mean = s * walks.mean + (1 - s) * model.mean
     variance = s**2 * walks.variance + (1 - s) ** 2 * model.variance
     return replace(

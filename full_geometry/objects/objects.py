@@ -39,14 +39,7 @@ from full_geometry.geometry.points import (
     opaque,
     surface_point,
 )
-from full_geometry.geometry.shape import (
-    Geometry,
-    analyse_shape,
-    geometry_of,
-    is_instance,
-    name_of,
-    scene_of,
-)
+from full_geometry.geometry.shape import Geometry, analyse_shape, geometry_of, is_instance, name_of, scene_of
 from full_geometry.geometry.snapshot import Snapshot
 from full_geometry.objects.inclusions import Inclusion, find_inclusions, place_of
 from full_geometry.settings import MM_PER_UNIT, Capabilities, check_variant

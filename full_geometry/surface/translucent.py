@@ -639,9 +639,7 @@ ETA = 1.3  # where none is given
 PAIRS = (("sigma_s", "sigma_a"), ("sigma_t", "albedo"), ("reflectance", "mfp"))
 
 
-def _inline_medium(
-    inline: dict[str, Any],
-) -> tuple[Medium, VaryingMedium | None, TexturedMedium | None]:
+def _inline_medium(inline: dict[str, Any]) -> tuple[Medium, VaryingMedium | None, TexturedMedium | None]:
     """The medium of coefficients, and how it varies in space or over the surface if it does."""
     values = {k: v if isinstance(v, (mi.Volume, mi.Texture)) else _numbers(k, v) for k, v in inline.items()}
     volumes = [key for key, value in values.items() if isinstance(value, mi.Volume)]

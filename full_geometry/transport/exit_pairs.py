@@ -48,12 +48,7 @@ if TYPE_CHECKING:
 
 
 def trace_exits(
-    obj: TranslucentObject,
-    starts: SurfacePoint,
-    seed: tuple[int, ...],
-    *,
-    fewest: int = 2,
-    most: int = 2**31 - 1,
+    obj: TranslucentObject, starts: SurfacePoint, seed: tuple[int, ...], *, fewest: int = 2, most: int = 2**31 - 1
 ) -> WalkExits:
     """One walk from each start. `starts`: where light is seen to leave, and the direction towards the eye. `seed`: of
     the pass, as for `walk.pass_seed`. `fewest`, `most`: numbers of scattering events that are kept. ValueError if

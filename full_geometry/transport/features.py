@@ -26,15 +26,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from full_geometry.geometry import mesh
-from full_geometry.geometry.points import (
-    SurfacePoint,
-    channel_mean,
-    lifted,
-    mirrored,
-    opaque,
-    refract_in,
-    turned,
-)
+from full_geometry.geometry.points import SurfacePoint, channel_mean, lifted, mirrored, opaque, refract_in, turned
 from full_geometry.objects.objects import TranslucentObject
 from full_geometry.surface.varying import grid_values
 from full_geometry.walk.media import walk_media

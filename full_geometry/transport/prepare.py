@@ -8,22 +8,9 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.geometry.instances import (
-    InstanceScene,
-    shapes_of,
-    shown_groups,
-)
-from full_geometry.geometry.points import (
-    ObjectModel,
-    Transport,
-)
-from full_geometry.geometry.shape import (
-    Geometry,
-    SceneMark,
-    analyse_shape,
-    check_together,
-    name_of,
-)
+from full_geometry.geometry.instances import InstanceScene, shapes_of, shown_groups
+from full_geometry.geometry.points import ObjectModel, Transport
+from full_geometry.geometry.shape import Geometry, SceneMark, analyse_shape, check_together, name_of
 from full_geometry.geometry.snapshot import Snapshot, same_objects
 from full_geometry.objects.inclusions import check_sensors, find_inclusions
 from full_geometry.objects.objects import (

@@ -29,12 +29,7 @@ POSE, VERTICES, NORMALS = ".to_world", ".vertex_positions", ".vertex_normals"
 
 
 def frames(
-    scene: mi.Scene | dict | str | Path,
-    rows: str | Path | Rows,
-    *,
-    sensor: int = 0,
-    spp: int = 0,
-    seed: int = 0,
+    scene: mi.Scene | dict | str | Path, rows: str | Path | Rows, *, sensor: int = 0, spp: int = 0, seed: int = 0
 ) -> Iterator[np.ndarray]:
     """Images (H, W, channels) of a scene, one for each row of edits, by its integrator.
 

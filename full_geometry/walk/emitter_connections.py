@@ -28,17 +28,7 @@ from full_geometry.geometry.rounding import before, blocked, place_bound, ray_fr
 from full_geometry.geometry.shape import pointer_numbers
 from full_geometry.objects.small_emitters import SmallEmitters, spread
 from full_geometry.walk.media import Coefficients, WalkMedia, WalkMedium, interaction_of, ray_of
-from full_geometry.walk.random_walk import (
-    Event,
-    Walk,
-    draw,
-    eval_phase,
-    fly,
-    free_path,
-    pick,
-    start_walk,
-    turn,
-)
+from full_geometry.walk.random_walk import Event, Walk, draw, eval_phase, fly, free_path, pick, start_walk, turn
 from full_geometry.walk.scores import Score, phase_score
 
 # ---- Connections with light subpaths --------------------------------------------------------------------------------
@@ -476,12 +466,7 @@ class InnerLights:
         return dr.reinterpret_array(mi.EmitterPtr, dr.gather(mi.UInt32, self.tables["pointer"], which)), here
 
     def light(
-        self,
-        k: mi.Int32,
-        at: mi.Interaction3f,
-        rng: mi.PCG32,
-        active: mi.Bool,
-        medium: WalkMedium | tuple[()] = (),
+        self, k: mi.Int32, at: mi.Interaction3f, rng: mi.PCG32, active: mi.Bool, medium: WalkMedium | tuple[()] = ()
     ) -> tuple:
         """The direction to a light from an interaction in object k, and its irradiance across, over its probability."""
         # one of n lights, n E

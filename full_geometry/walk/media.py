@@ -561,12 +561,7 @@ class WalkMedia:
         return Coefficients(*(dr.select(textured, a, b) for a, b in zip(own, result)))
 
     def transmittance(
-        self,
-        k: mi.Int32,
-        ray: mi.Ray3f,
-        distance: mi.Float,
-        rng: mi.PCG32,
-        medium: WalkMedium | tuple[()] = (),
+        self, k: mi.Int32, ray: mi.Ray3f, distance: mi.Float, rng: mi.PCG32, medium: WalkMedium | tuple[()] = ()
     ) -> mi.Spectrum:
         """exp(-∫ sigma_t) over a distance along a ray inside object k; by ratio tracking where a medium varies."""
         # exp(-sigma_t d) of a homogeneous medium

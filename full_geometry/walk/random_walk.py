@@ -507,12 +507,7 @@ class ExitVisitor:
 
 
 def exits(
-    media: WalkMedia,
-    k: int,
-    start: SurfacePoint,
-    seed: int | tuple[int, ...],
-    fewest: int = 0,
-    most: int = MOST,
+    media: WalkMedia, k: int, start: SurfacePoint, seed: int | tuple[int, ...], fewest: int = 0, most: int = MOST
 ) -> WalkExits:
     """Where walks from points on object k leave it. `media`, `k`, `start`, `seed`: as of `walk_from`. `fewest`, `most`:
     numbers of scattering events that are kept, among the orders of the object. Returns exits in the order of the

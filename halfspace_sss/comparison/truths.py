@@ -294,11 +294,7 @@ def trace_order(
 
 
 def validate(
-    rows: Callable[[Truth], bool] | None = None,
-    seed: int = 0,
-    quick: bool = False,
-    *,
-    progress: Progress | None = None,
+    rows: Callable[[Truth], bool] | None = None, seed: int = 0, quick: bool = False, *, progress: Progress | None = None
 ) -> Validation:
     """Trace every row of the packaged table of half-space numbers and compare.
 

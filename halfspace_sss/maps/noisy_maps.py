@@ -208,11 +208,7 @@ class MapLaunch:
 
 
 def trace_groups(
-    groups: Groups,
-    grid: CellGrid,
-    events: float,
-    seed: tuple[int, ...],
-    backend: str = "llvm",
+    groups: Groups, grid: CellGrid, events: float, seed: tuple[int, ...], backend: str = "llvm"
 ) -> list[MapLaunch]:
     """Launches of `PER_LAUNCH` groups that together trace all of them, those of long walks side by side.
 
