@@ -23,7 +23,7 @@ from full_geometry.geometry.points import floats, opaque
 from full_geometry.geometry.shape import name_of
 from full_geometry.settings import check_parameters
 from full_geometry.surface.textured import TexturedMedium
-from full_geometry.surface.translucent import PARAMETERS, boundary_of, is_smooth_boundary, read_medium_spec
+from full_geometry.surface.translucent import PARAMETERS, boundary_of, is_smooth_boundary, number_of, read_medium_spec
 from halfspace_sss.arrays import library
 from halfspace_sss.checks import check_interval
 from halfspace_sss.physics.fresnel import F_r, F_t, mu_internal
@@ -228,7 +228,7 @@ def _class(variant: str) -> type:
 
         def __init__(self, props: mi.Properties) -> None:
             mi.BSDF.__init__(self, props)
-            self.thickness = float(props["thickness"])
+            self.thickness = number_of(props, "thickness")
             self.sheet = _read_sheet(props, self.thickness)
             sides = int(mi.BSDFFlags.FrontSide) | int(mi.BSDFFlags.BackSide)
             self.m_components = [int(getattr(mi.BSDFFlags, kind)) | sides for kind in KINDS]

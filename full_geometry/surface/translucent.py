@@ -544,11 +544,13 @@ def read_medium_spec(props: mi.Properties) -> MediumSpec:
         (label, medium, varying, textured), spectral = _medium(props), None
     model, orders = props.get("model", "neural"), props.get("orders", "total")
     check_choice("orders", orders, ORDERS)
-    priority = float(props["priority"]) if "priority" in props else None
+    priority, reflection = number_of(props, "priority"), props.get("reflection", True)
     if not math.isfinite(priority or 0.0):
         raise ValueError(f"priority must be finite, got {priority!r}")
+    if not isinstance(reflection, bool):
+        raise ValueError(f"reflection must be true or false, got {reflection!r}")
     return MediumSpec(
-        label=label, medium=medium, model=model, orders=orders, reflection=bool(props.get("reflection", True)),
+        label=label, medium=medium, model=model, orders=orders, reflection=reflection,
         varying=varying, textured=textured, spectral=spectral, priority=priority,
     )  # fmt: skip
 
@@ -616,8 +618,7 @@ def _medium(props: mi.Properties) -> tuple[str, Medium, VaryingMedium | None, Te
     if "material" in props:
         if inline:
             raise ValueError(f"material must stand without {', '.join(inline)}, got both")
-        dilution = float(props["dilution"]) if "dilution" in props else None
-        material = materials.load(props["material"], dilution=dilution)
+        material = materials.load(props["material"], dilution=number_of(props, "dilution"))
         label, medium, names = material.name, material.medium, material.channels
     elif "dilution" in props:
         raise ValueError(f"dilution must be left out without material, got {props['dilution']!r}")
@@ -650,7 +651,10 @@ def _inline_medium(inline: dict[str, Any]) -> tuple[Medium, VaryingMedium | None
                 raise ValueError(f"{key} must be constant, got a {kind}; {', '.join(able)} may vary")
     if volumes and textures:
         raise ValueError(f"{textures[0]} must be a number where {volumes[0]} is a volume, got a texture")
-    eta, g = float(np.max(values.pop("eta", ETA))), values.pop("g", 0.0)
+    etas, g = np.unique(values.pop("eta", ETA)), values.pop("g", 0.0)
+    if len(etas) > 1:
+        raise ValueError(f"eta must be one number for all channels, got {etas.tolist()}: dispersion is left out")
+    eta = float(etas[0])
     pair = next(pair for pair in PAIRS if values.keys() >= set(pair))
     if extra := values.keys() - set(pair) - ({"scale"} if "albedo" in pair else set()):
         raise ValueError(f"{' and '.join(pair)} must stand without {', '.join(sorted(extra))}, got both")
@@ -689,6 +693,14 @@ def _of_channels(medium: Medium, n: int) -> Medium:
     """A medium of n channels, the same in all if it has none."""
     same = {key: np.broadcast_to(getattr(medium, key), n).astype(float) for key in ("sigma_s", "sigma_a", "g")}
     return Medium(**same, eta=medium.eta)
+
+
+def number_of(props: mi.Properties, key: str) -> float | None:
+    """A parameter that is one number; None if there is none."""
+    try:
+        return float(props[key]) if key in props else None
+    except (TypeError, ValueError):
+        raise ValueError(f"{key} must be a number, got {props[key]!r}") from None
 
 
 def _numbers(key: str, value: Any) -> Any:

@@ -89,6 +89,22 @@ def test_an_unknown_parameter_is_refused_by_name(plugin, wrong, meant):
     assert meant is None or f"got {wrong!r}; did you mean {meant!r}?" in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("parameter", "message"),
+    [
+        ({"priority": "1,2"}, "priority must be a number, got '1,2'"),
+        ({"thickness": "thin"}, "thickness must be a number, got 'thin'"),
+        ({"material": "milk", "dilution": "half"}, "dilution must be a number, got 'half'"),
+        ({"reflection": "false"}, "reflection must be true or false, got 'false'"),
+        ({"eta": "1.3,1.4,1.5"}, r"eta must be one number for all channels, got \[1.3, 1.4, 1.5\]"),
+    ],
+)
+def test_a_parameter_of_another_kind_is_refused_by_name_and_value(parameter, message):
+    medium = {} if "material" in parameter else {"sigma_s": "1,2,3", "sigma_a": 0.1}
+    with pytest.raises(RuntimeError, match=message):
+        mi.load_dict({"type": "translucent", **medium, **parameter})
+
+
 def test_an_unknown_parameter_in_a_file_is_refused_by_name():
     scene = (
         '<scene version="3.0.0"><bsdf type="translucent"><string name="material" value="marble"/>'
