@@ -6,10 +6,11 @@ from analytic_models.forward_scattering_dipole import ForwardScatteringDipole
 from analytic_models.normalized_diffusion import NormalizedDiffusion
 from analytic_models.photon_beam_diffusion import PhotonBeamDiffusion
 from analytic_models.standard_dipole import StandardDipole, StandardDipoleNormalized
+from halfspace_sss.interface.model import BSSRDF
 
 __all__ = ["MODELS"]
 
-MODELS = [
+MODELS: list[type[BSSRDF]] = [
     StandardDipole,
     StandardDipoleNormalized,
     BetterDipole,

@@ -112,7 +112,8 @@ class ForwardScatteringDipole(BSSRDF):
         if not (isinstance(n_samples, int) and 2 <= n_samples <= 1000):
             raise ValueError(f"n_samples must be an integer in [2, 1000], got {n_samples!r}")
         check_choice("virtual_source", virtual_source, VIRTUAL_SOURCES)
-        self.n_samples, self.virtual_source = n_samples, virtual_source
+        self.n_samples = n_samples
+        self.virtual_source = virtual_source
         m = medium.in_mfp()
         lib = library(m.sigma_s)
         self._p = lib.maximum(0.5 * m.sigma_s * (1 - m.g), 1e-12)

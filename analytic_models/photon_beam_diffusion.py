@@ -49,7 +49,9 @@ class PhotonBeamDiffusion(BSSRDF):
         if not (isinstance(n_samples, int) and 2 <= n_samples <= 1000):
             raise ValueError(f"n_samples must be an integer in [2, 1000], got {n_samples!r}")
         check_choice("kappa", kappa, KAPPAS)
-        self.n_samples, self.kappa, self.moments = n_samples, kappa, moments
+        self.n_samples = n_samples
+        self.kappa = kappa
+        self.moments = moments
         self._boundary = DiffuseBoundary.for_index(medium.eta, moments)
         self._c = Grosjean(medium, self._boundary)
         self._kappa_rate = 2 * (self._c.sigma_t_prime if kappa == "reduced" else 1 + 0 * self._c.sigma_t_prime)

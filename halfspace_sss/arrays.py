@@ -25,11 +25,14 @@ if TYPE_CHECKING:
     import drjit
     import torch
 
-Lanes: TypeAlias = "drjit.ArrayBase"  # of Dr.Jit, one value a lane
-Real: TypeAlias = "float | np.ndarray | torch.Tensor | drjit.ArrayBase"  # a number, or an array of any library
+Lanes: TypeAlias = "drjit.AnyArray"  # of Dr.Jit, one value a lane
+Real: TypeAlias = "float | np.ndarray | torch.Tensor | drjit.AnyArray"  # a number, or an array of any library
+PerChannel: TypeAlias = "Real | Sequence[float]"  # a number, or one for each channel
 
 
-def _fold(f: Callable[..., tuple], tables: tuple, state: tuple, x: Real) -> tuple:
+def _fold(
+    f: Callable[..., tuple[Real, ...]], tables: tuple[np.ndarray, ...], state: tuple[Real, ...], x: Real
+) -> tuple[Real, ...]:
     """state = f(*state, *row) for each row of the equally long 1-D `tables`, in order; x tells the array type.
     A loop of array operations, one symbolic loop for Dr.Jit: kernels stay small however many rows there are."""
     for row in zip(*(table.tolist() for table in tables)):
@@ -42,7 +45,28 @@ def _check_no_derivatives(value: Real) -> None:
         raise ValueError("a medium with derivatives is asked with torch tensors: use medium.detached() for its numbers")
 
 
-class _NumpyLibrary:
+class Library:
+    """Functions of the arrays of one library, by the names of NumPy."""
+
+    exp: Callable[[Real], Real]
+    expm1: Callable[[Real], Real]
+    log: Callable[[Real], Real]
+    log1p: Callable[[Real], Real]
+    sqrt: Callable[[Real], Real]
+    sin: Callable[[Real], Real]
+    cos: Callable[[Real], Real]
+    abs: Callable[[Real], Real]
+    floor: Callable[[Real], Real]
+    isfinite: Callable[[Real], Real]
+    minimum: Callable[[Real, Real], Real]
+    maximum: Callable[[Real, Real], Real]
+    arctan2: Callable[[Real, Real], Real]
+    where: Callable[[Real, Real, Real], Real]
+    stack: Callable[[list[Real]], Real]
+    fold: Callable[..., tuple[Real, ...]]
+
+
+class _NumpyLibrary(Library):
     """NumPy, and plain Python numbers."""
 
     exp, expm1, log, log1p, sqrt = (staticmethod(f) for f in (np.exp, np.expm1, np.log, np.log1p, np.sqrt))
@@ -79,7 +103,7 @@ class _NumpyLibrary:
     fold = staticmethod(_fold)
 
 
-class _TorchLibrary:
+class _TorchLibrary(Library):
     """torch tensors on any device."""
 
     def __init__(self) -> None:
@@ -125,11 +149,11 @@ class _TorchLibrary:
     def take(self, table: np.ndarray, index: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
         return self.like(table, x)[index]
 
-    def stack(self, values: list) -> torch.Tensor:
+    def stack(self, values: list[torch.Tensor]) -> torch.Tensor:
         return self.torch.stack(values, dim=-1)
 
 
-class _DrJitLibrary:
+class _DrJitLibrary(Library):
     """Dr.Jit arrays of any backend; one lane per query."""
 
     def __init__(self) -> None:
@@ -169,7 +193,9 @@ class _DrJitLibrary:
     def take(self, table: np.ndarray, index: Lanes, x: Lanes) -> Lanes:
         return self.dr.gather(type(x), type(x)(table), self.dr.uint32_array_t(type(x))(index))
 
-    def fold(self, f: Callable[..., tuple], tables: tuple, state: tuple, x: Lanes) -> tuple:
+    def fold(
+        self, f: Callable[..., tuple[Lanes, ...]], tables: tuple[np.ndarray, ...], state: tuple[Lanes, ...], x: Lanes
+    ) -> tuple[Lanes, ...]:
         dr, kind = self.dr, type(x)
         n, columns = len(tables[0]), [kind(table) for table in tables]
         zero = dr.uint32_array_t(kind)(0)
@@ -180,18 +206,17 @@ class _DrJitLibrary:
         # derivatives backwards store the states of n rounds
         return dr.while_loop((zero, *state), lambda k, *_: k < n, body, label="fold", max_iterations=n)[1:]
 
-    def stack(self, values: list) -> Lanes:
+    def stack(self, values: list[Lanes]) -> Lanes:
         raise ValueError("a Dr.Jit query is answered by a medium of one channel: use medium.channel(k)")
 
 
-Library: TypeAlias = "_NumpyLibrary | _TorchLibrary | _DrJitLibrary"
 _NUMPY = _NumpyLibrary()
 
 
 _torch_library, _drjit_library = once(_TorchLibrary), once(_DrJitLibrary)
 
 
-def asks_nothing(lib: Library, args: tuple) -> bool:
+def asks_nothing(lib: Library, args: tuple[Real, ...]) -> bool:
     """Whether a Dr.Jit array of a query is empty, beside which Dr.Jit refuses numbers; arrays of others may be."""
     return isinstance(lib, _DrJitLibrary) and any(lib.dr.width(a) == 0 for a in args)
 
@@ -255,7 +280,7 @@ def _converted(name: str, convert: Callable[[object], Real], value: object) -> R
         raise ValueError(f"{name} must be real numbers, got {value!r}") from error
 
 
-def broadcast_query(*args: Real, names: Sequence[str] = ()) -> tuple[Library, tuple]:
+def broadcast_query(*args: Real, names: Sequence[str] = ()) -> tuple[Library, tuple[Real, ...]]:
     """The library of a query and its arguments as broadcast floating-point arrays of that library.
     The precision is the widest among the array arguments; Python numbers follow it, and a query of Python numbers only
     is answered in float64. `args`: of the query. `names`: of these, for messages. ValueError if the shapes do not

@@ -146,7 +146,7 @@ def limit_threads(threads: int) -> None:
     dr.set_thread_count(threads)
 
 
-def one_blas_thread() -> AbstractContextManager:
+def one_blas_thread() -> AbstractContextManager[object]:
     """One thread of the BLAS: its sums then have one order, and small matrices are slower with more.
     On a machine that has other work they are so many times over."""
     return _controller().limit(limits=1, user_api="blas")

@@ -9,6 +9,8 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
+from halfspace_sss.arrays import Library, Real
+
 ROUNDING_ULPS = 4
 
 
@@ -88,7 +90,7 @@ def check_cosine(name: str, value: object, low: float = 0.0) -> float:
     return float(value)
 
 
-def check_query(lib: object, args: tuple, given: tuple) -> tuple:
+def check_query(lib: Library, args: tuple[Real, ...], given: tuple[Real, ...]) -> tuple[Real, ...]:
     """Arguments of a query in their ranges, cosines that exceed 1 by rounding as 1; also refuses NaN.
     `args`: the arguments in one library and precision. `given`: the same as they came, whose precision says what is
     rounding."""

@@ -51,7 +51,7 @@ def offered(group: str) -> Iterator[tuple[str, object]]:
             yield entry.name, result
 
 
-def commands() -> Iterator[tuple[str, Callable]]:
+def commands() -> Iterator[tuple[str, Callable[..., object]]]:
     """Name and function of every command that a package adds."""
     for name, each in offered(COMMANDS):
         if callable(each):

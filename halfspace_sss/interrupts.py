@@ -25,7 +25,7 @@ class Interrupts:
 
     def __init__(self) -> None:
         self.received: int | None = None
-        self.told = False
+        self.told: bool = False
         self._depth = 0
         self._before: dict[int, Callable | int | None] = {}
         self._hook: Callable | None = None
@@ -112,7 +112,7 @@ def _is_importing(frame: FrameType | None) -> bool:
     return False
 
 
-interrupts = Interrupts()
+interrupts: Interrupts = Interrupts()
 
 
 @contextmanager

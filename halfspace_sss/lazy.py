@@ -7,6 +7,9 @@ import importlib
 import sys
 import threading
 from collections.abc import Callable, Iterable, Mapping
+from typing import ParamSpec, TypeVar
+
+P, R = ParamSpec("P"), TypeVar("R")
 
 
 def lazy_names(
@@ -30,14 +33,14 @@ def lazy_names(
     return get, names
 
 
-def once(f: Callable) -> Callable:
+def once(f: Callable[P, R]) -> Callable[P, R]:
     """`functools.cache` under a lock: threads that ask while f runs wait for its result and do not run it again.
     Mitsuba makes the objects of a scene in parallel, and each asks for materials and models."""
     cached, lock = functools.cache(f), threading.RLock()
 
     @functools.wraps(f)
-    def answer(*args: object) -> object:
+    def answer(*args: P.args, **named: P.kwargs) -> R:
         with lock:
-            return cached(*args)
+            return cached(*args, **named)
 
     return answer

@@ -23,7 +23,8 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-JsonDict: TypeAlias = "dict[str, None | bool | float | str | list | dict]"  # what JSON holds
+Json: TypeAlias = "None | bool | float | str | list[Json] | dict[str, Json]"  # what JSON holds
+JsonDict: TypeAlias = "dict[str, Json]"
 LARGEST, LARGEST_TEXT = 10**9, 10**7  # bytes
 LIBRARIES = ("halfspace-sss", "numpy", "drjit", "mitsuba", "torch", "xarray", "zarr")
 
@@ -60,7 +61,7 @@ def provenance(**parameters: object) -> JsonDict:
     }
 
 
-def path_of(path: str | os.PathLike) -> Path:
+def path_of(path: str | os.PathLike[str]) -> Path:
     """A path of this machine, or that of an object store for a URL that fsspec knows, such as s3://BUCKET/maps.
     ValueError if universal_pathlib is not installed, or no file system has the protocol. The package of the file
     system, such as s3fs, is missed when the path is used."""
@@ -75,7 +76,7 @@ def path_of(path: str | os.PathLike) -> Path:
     return UPath(str(path))
 
 
-def is_remote(path: str | os.PathLike) -> bool:
+def is_remote(path: str | os.PathLike[str]) -> bool:
     """Whether `path_of` found it to be in an object store, where files are whole or absent and nothing is renamed."""
     return hasattr(path, "storage_options")
 
@@ -189,7 +190,7 @@ def naming(path: Path) -> Iterator[None]:
         raise OSError(error.errno, error.strerror, str(path)) from error
 
 
-class KeptRows(dict):
+class KeptRows(dict[str, Json]):
     """Rows of a long table by name, as JSON values, in a file: the same run started again goes on after them.
     `path`: file of the rows, a line for each, after a line of what they depend on. `of`: what the rows depend on
     besides versions and commit; rows of something else are dropped."""

@@ -91,7 +91,7 @@ class Part:
     params: Params
     work: float
     needs: tuple[str, ...] = ()
-    inputs: tuple[str | os.PathLike, ...] = ()
+    inputs: tuple[str | os.PathLike[str], ...] = ()
     like: str = ""
 
     def __post_init__(self) -> None:
@@ -177,7 +177,7 @@ def _package_hash(name: str) -> str:
     return digest.hexdigest()
 
 
-def _file_hash(part: Part, path: str | os.PathLike) -> str:
+def _file_hash(part: Part, path: str | os.PathLike[str]) -> str:
     try:
         return hashlib.sha256(Path(path).read_bytes()).hexdigest()
     except OSError as error:

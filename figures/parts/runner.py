@@ -72,7 +72,7 @@ def exr_bytes(image: np.ndarray, name: str, about: str) -> bytes:
     return bytes(stream.raw_buffer())
 
 
-def read_exr(path: str | os.PathLike) -> np.ndarray:
+def read_exr(path: str | os.PathLike[str]) -> np.ndarray:
     """The float32 image of an EXR file, (H, W) or (H, W, channels); ValueError with its name if it cannot be read."""
     Bitmap, _ = _mitsuba()
     try:

@@ -601,7 +601,10 @@ class AreaPoints:
 
     def __init__(self, shape: mi.Shape) -> None:
         self.shape = shape
-        self.faces = self.centre = self.light = None
+        self.faces: mi.DiscreteDistribution | None = None
+        self.centre: np.ndarray | None = None
+        self.light: mi.Float | None = None
+        self.areas: np.ndarray | None = None
         if shape.class_name() == "Sphere":  # Mitsuba's normals of sampled points are wrong where it is mirrored
             self.centre = np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)[:3, 3]
         if mesh.has_faces(shape):

@@ -515,8 +515,6 @@ class SceneMark:
     Mitsuba lists the shapes of each scene in a variable, which is kept in place of the scene: that would never be
     freed, and its address is given again once it is."""
 
-    __hash__ = None
-
     def __init__(self, scene: mi.Scene) -> None:
         self._kept = scene.shapes_dr() if _by_optix() else mi.ShapePtr()
 

@@ -22,8 +22,6 @@ from full_geometry.geometry import mesh
 class Snapshot:
     """Objects of Mitsuba, which are kept, and checksums of their parameters; equal to another where nothing differs."""
 
-    __hash__ = None
-
     def __init__(self, nodes: list[mi.Object], checksums: dict[str, bytes]) -> None:
         self._nodes, self._checksums = nodes, checksums
 
@@ -76,7 +74,7 @@ def _checksum(value: object) -> bytes:
     return result.digest()
 
 
-def _numbers(value: dr.ArrayBase | object) -> Iterator[np.ndarray]:
+def _numbers(value: dr.AnyArray | object) -> Iterator[np.ndarray]:
     """The numbers of a parameter, array by array: to join arrays Dr.Jit would run a kernel."""
     if dr.is_tensor_v(value):
         yield np.array(value.shape)

@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -52,7 +53,7 @@ WALK = "translucent_walk"
 
 
 def fit(
-    scene: mi.Scene | dict | str | Path,
+    scene: mi.Scene | dict[str, Any] | str | Path,
     images: Sequence[GivenView],
     parameters: Sequence[str] = ("albedo", "sigma_t"),
     model: str | None = WALK,

@@ -223,7 +223,7 @@ class Mesh:
         set_vertex_normals(mesh, normals)
         return mesh
 
-    def write_ply(self, path: str | os.PathLike) -> Path:
+    def write_ply(self, path: str | os.PathLike[str]) -> Path:
         """Write the mesh as a binary PLY file, whole or not at all; the same mesh gives the same bytes."""
         header = (
             "ply\nformat binary_little_endian 1.0\ncomment lengths in mm\n"

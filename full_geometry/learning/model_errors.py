@@ -247,7 +247,7 @@ def errors(
     *,
     mm_per_unit: float | None = None,
     object: str | None = None,
-    folder: str | os.PathLike | None = None,
+    folder: str | os.PathLike[str] | None = None,
     **sampling: int,
 ) -> list[RadianceError]:
     """The error of a model of an object, by name: what a user is to expect of images before the first one.
@@ -271,7 +271,7 @@ def errors(
     return errors_of(obj, transports, **sampling)[model]
 
 
-def transport_of(obj: TranslucentObject, model: str, folder: str | os.PathLike | None = None) -> Transport:
+def transport_of(obj: TranslucentObject, model: str, folder: str | os.PathLike[str] | None = None) -> Transport:
     """The transport called `model` of an object: "full_geometry", one that a package adds, or a half-space model.
     ValueError if the object has not been trained, there is no such model, it refuses the object as renders would, or it
     has no S for two points of a surface."""

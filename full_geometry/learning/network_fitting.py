@@ -110,7 +110,7 @@ class Correction(NamedNetwork):
         return BOUND * torch.tanh(self.layers(x, first) / BOUND)
 
 
-def likelihood(walks: tuple, proposals: tuple, kept: float) -> torch.Tensor:
+def likelihood(walks: tuple[torch.Tensor, ...], proposals: tuple[torch.Tensor, ...], kept: float) -> torch.Tensor:
     """E_q[(S_0 mu_i / q) exp f] - E_walks[T f], sum over channels.
     `walks`: f and T, (channels, n) both. `proposals`: f and S_0 mu_i / q, (channels, m) both. `kept`: share of all
     walks that the n stand for."""
@@ -162,7 +162,7 @@ class AlbedoNetwork(NamedNetwork):
         return torch.cat([exit, units[0], entry, units[1], pair])
 
 
-def mean_likelihood(both: tuple, T: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
+def mean_likelihood(both: tuple[torch.Tensor, ...], T: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
     """E[alpha - T log alpha] over walks, sum over channels times their scale; its minimum is alpha = E[T | exit].
     `both`: from `AlbedoNetwork`. `T`: (2 channels, n). `scale`: (2 channels, 1)."""
     alpha, log_alpha = both

@@ -74,14 +74,14 @@ def untrained(scene: mi.Scene) -> dict[str, list[str]]:
 
 
 def render(
-    scene: mi.Scene | dict[str, Any] | str | os.PathLike,
-    path: str | os.PathLike,
+    scene: mi.Scene | dict[str, Any] | str | os.PathLike[str],
+    path: str | os.PathLike[str],
     *,
     train_seconds: float,
     train_error: float = TRAIN_ERROR,
     sensor: int = 0,
     seed: int = 0,
-    resume: bool | str | os.PathLike = True,
+    resume: bool | str | os.PathLike[str] = True,
     listeners: Listeners = Listeners(),  # noqa: B008
     denoise: Denoise | None = None,
     **limits: Any,

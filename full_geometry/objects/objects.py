@@ -155,7 +155,7 @@ def outermost(scene: mi.Scene) -> list[mi.Shape]:
     return [shape for shape in shapes if not any(shape is inclusion.node for inclusion in result)]
 
 
-def places_of(scene: mi.Scene) -> list:
+def places_of(scene: mi.Scene) -> list[Snapshot | list[float] | None]:
     """Snapshots of shapes, those of groups too, and places of lamps of a scene, which show a move."""
     shapes = [node for node in mi.traverse(scene).hierarchy if isinstance(node, mi.Shape)]
     lamps = [place_of(emitter) for emitter in scene.emitters()]

@@ -6,6 +6,7 @@ Mitsuba's volume path tracers, which nobody here wrote, then render the same lig
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -17,10 +18,12 @@ from full_geometry.surface.varying import VaryingMedium
 from halfspace_sss.checks import check_interval
 
 FAR = 1e5  # scene units within which objects lie
-VOLUME_PATH = {"type": "volpathmis", "max_depth": -1, "rr_depth": 64}
+VOLUME_PATH: dict[str, str | int] = {"type": "volpathmis", "max_depth": -1, "rr_depth": 64}
 
 
-def with_media(scene: dict | str | Path, mm_per_unit: float, integrator: dict | None = None) -> mi.Scene:
+def with_media(
+    scene: dict[str, Any] | str | Path, mm_per_unit: float, integrator: dict[str, Any] | None = None
+) -> mi.Scene:
     """A Mitsuba scene in which each translucent object is a dielectric shape filled with a `homogeneous` medium,
     or with a `heterogeneous` one where the medium varies in space.
 

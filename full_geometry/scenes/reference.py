@@ -174,13 +174,13 @@ Progress = Callable[[Reference], None]
 
 
 def render(
-    scene: mi.Scene | dict[str, Any] | str | os.PathLike,
-    path: str | os.PathLike,
+    scene: mi.Scene | dict[str, Any] | str | os.PathLike[str],
+    path: str | os.PathLike[str],
     *,
-    integrator: dict | None = None,
+    integrator: dict[str, Any] | None = None,
     sensor: int = 0,
     seed: int = 0,
-    resume: bool | str | os.PathLike = True,
+    resume: bool | str | os.PathLike[str] = True,
     progress: Progress | None = None,
     denoise: Denoise | None = None,
     **limits: float | None,
@@ -223,7 +223,7 @@ def render(
 
 def _in_passes(
     scene: mi.Scene, integrator: mi.Integrator, path: Path, about: dict[str, Any], limits: Limits,
-    resume: bool | str | os.PathLike, progress: Progress | None, denoise: Denoise | None,
+    resume: bool | str | os.PathLike[str], progress: Progress | None, denoise: Denoise | None,
 ) -> Reference:  # fmt: skip
     """Take passes until a limit is reached, and write the file now and then and at the end."""
     result = _start(path, resume, about)
@@ -362,7 +362,7 @@ def channel_names(film: mi.Film, integrator: mi.Integrator, channels: int) -> li
 
 
 def loaded(
-    scene: mi.Scene | dict[str, Any] | str | os.PathLike, integrator: dict[str, Any] | None, sensor: int
+    scene: mi.Scene | dict[str, Any] | str | os.PathLike[str], integrator: dict[str, Any] | None, sensor: int
 ) -> tuple[mi.Scene, mi.Integrator]:
     """The scene and its integrator as Mitsuba objects; errors as of `render`."""
     if isinstance(scene, (str, os.PathLike)) and not Path(scene).is_file():
@@ -418,7 +418,7 @@ def chosen(scene: mi.Scene, integrator: mi.Integrator) -> dict[str, Any]:
     return {"choices": result.sentences, "chosen": [result.light, *result.models.values()]}
 
 
-def _start(path: Path, resume: bool | str | os.PathLike, about: dict[str, Any]) -> Reference | None:
+def _start(path: Path, resume: bool | str | os.PathLike[str], about: dict[str, Any]) -> Reference | None:
     """The render to go on with, if there is one.
     ValueError if it is damaged or of another render."""
     if resume is False or (resume is True and not path.exists()):

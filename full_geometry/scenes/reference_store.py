@@ -166,7 +166,7 @@ def save(path: Path, reference: Reference) -> None:
     write_together({path: _written(bitmap, mi.Bitmap.FileFormat.OpenEXR), path.with_suffix(".json"): text + "\n"})
 
 
-def load(path: str | os.PathLike) -> Reference:
+def load(path: str | os.PathLike[str]) -> Reference:
     """Read the file of a reference.
     ValueError if there is no such file, or it is damaged or not one of these; the message names it."""
     name = os.fspath(path)

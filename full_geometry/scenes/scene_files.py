@@ -117,7 +117,7 @@ _INTEGRATORS = {False: "bssrdf", True: "translucent_walk"}
 
 
 def load_scene(
-    scene: dict | str | Path,
+    scene: dict[str, Any] | str | Path,
     model: str | None = None,
     orders: str | None = None,
     parameters: Mapping[str, str] | None = None,
@@ -150,7 +150,7 @@ def load_scene(
 
 
 def open_scene(
-    scene: dict | str | Path,
+    scene: dict[str, Any] | str | Path,
     model: str | None = None,
     orders: str | None = None,
     parameters: Mapping[str, str] | None = None,
@@ -195,7 +195,7 @@ def open_scene(
     return loaded
 
 
-def names_nothing(scene: dict | str | Path, parameters: Mapping[str, str] | None = None) -> bool:
+def names_nothing(scene: dict[str, Any] | str | Path, parameters: Mapping[str, str] | None = None) -> bool:
     """Whether a scene has no integrator and names no model, so that what renders it is left to us."""
     state, _ = parsed(scene, parameters or {})
     integrators = any(node.type == mi.ObjectType.Integrator for node in state.nodes)
@@ -215,7 +215,7 @@ def _settings(settings: Mapping[str, float]) -> tuple[dict, dict]:
     return {key: value for key, value in settings.items() if key != "layers"}, walk
 
 
-def load_objects(scene: dict | str | Path, parameters: Mapping[str, str] | None = None) -> mi.Scene:
+def load_objects(scene: dict[str, Any] | str | Path, parameters: Mapping[str, str] | None = None) -> mi.Scene:
     """A Mitsuba scene whose objects are looked at one by one: none is merged with another, and no model is made.
 
     Args:
@@ -240,7 +240,7 @@ def _surfaces(state: ParserState) -> list[mi.Properties]:
     return results
 
 
-def _made(scene: dict | str | Path, state: ParserState, config: ParserConfig) -> mi.Scene:
+def _made(scene: dict[str, Any] | str | Path, state: ParserState, config: ParserConfig) -> mi.Scene:
     """The scene; files that an XML file names are looked for beside it first."""
     before, here = mi.file_resolver(), mi.FileResolver(mi.file_resolver())
     if not isinstance(scene, dict):
@@ -266,7 +266,7 @@ def _check_registered() -> None:
         ) from error
 
 
-def parsed(scene: dict | str | Path, parameters: Mapping[str, str]) -> tuple[ParserState, ParserConfig]:
+def parsed(scene: dict[str, Any] | str | Path, parameters: Mapping[str, str]) -> tuple[ParserState, ParserConfig]:
     """What a scene says, and how Mitsuba is to make it; ValueError if it cannot be read."""
     check_variant()
     _check_registered()
@@ -291,7 +291,7 @@ def parsed(scene: dict | str | Path, parameters: Mapping[str, str]) -> tuple[Par
     return state, config
 
 
-def _transform(scene: dict | str | Path, state: ParserState, config: ParserConfig, apart: bool) -> None:
+def _transform(scene: dict[str, Any] | str | Path, state: ParserState, config: ParserConfig, apart: bool) -> None:
     """Resolve what a scene says; meshes of one translucent surface stay `apart`, or become one, as others do."""
     config.merge_meshes = False
     try:
@@ -340,7 +340,7 @@ def apart(function: Callable, parse: Callable) -> Callable:
     """
 
     @functools.wraps(function)
-    def found(scene: dict | str, *args: object, **more: object) -> mi.Scene | mi.Object:
+    def found(scene: dict[str, Any] | str, *args: object, **more: object) -> mi.Scene | mi.Object:
         if not args and "optimize" not in more and _asks_apart(parse, scene, more):
             more["optimize"] = False
         return function(_own_bitmaps(scene), *args, **more)
@@ -355,7 +355,7 @@ def _own_bitmaps(scene: Any) -> Any:
     return mi.Bitmap(scene) if isinstance(scene, mi.Bitmap) else scene
 
 
-def _asks_apart(parse: Callable, scene: dict | str, more: Mapping[str, object]) -> bool:
+def _asks_apart(parse: Callable, scene: dict[str, Any] | str, more: Mapping[str, object]) -> bool:
     """Whether meshes of a scene have to stay apart; what cannot be read is left to who loads it."""
     if isinstance(scene, dict) and scene.get("type") != "scene":
         return False
@@ -372,7 +372,7 @@ def _asks_apart(parse: Callable, scene: dict | str, more: Mapping[str, object]) 
     return _shares_surface(state)
 
 
-def _unreadable(scene: dict | str | Path, error: RuntimeError) -> ValueError:
+def _unreadable(scene: dict[str, Any] | str | Path, error: RuntimeError) -> ValueError:
     name = "scene" if isinstance(scene, dict) else f"scene {str(scene)!r}"
     return ValueError(f"{name} cannot be read: {first_cause(error)}")
 

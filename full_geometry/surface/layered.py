@@ -193,7 +193,7 @@ class LayerVolume:
     depths: Depths
     below: tuple[float, ...]
     values: np.ndarray
-    tables: list = field(init=False)
+    tables: list[list[mi.Float]] = field(init=False)
 
     def __post_init__(self) -> None:
         tables = [[mi.Float([float(v)]) for v in row] for row in self.values]

@@ -65,8 +65,11 @@ class MediumDerivatives:
     the model has no derivatives by them."""
 
     def __init__(self, surface: mi.BSDF, mm_per_unit: float, model: str, plane: str) -> None:
-        self.surface, self.spec, self.mm_per_unit = surface, surface.spec, mm_per_unit
-        self.model, self.plane = model, plane
+        self.surface = surface
+        self.spec: Any = surface.spec
+        self.mm_per_unit = mm_per_unit
+        self.model = model
+        self.plane = plane
         self._stencils: dict[str, Stencil] = {}
 
     def prepare(self, transport: Transport | None) -> None:

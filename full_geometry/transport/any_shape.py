@@ -394,14 +394,14 @@ def load(path: Path) -> dict[str, np.ndarray]:
     return {name: value.astype(np.float32) for name, value in arrays.items()}
 
 
-def checksums(obj: TranslucentObject, path: str | os.PathLike | None = None) -> tuple[str, ...]:
+def checksums(obj: TranslucentObject, path: str | os.PathLike[str] | None = None) -> tuple[str, ...]:
     """Checksums of the shipped weights or others, and of those of the half-space models that they correct."""
     models = [bssrdf(MODEL, m) for m in obj.media]
     own = checksum_of(Path(path) if path is not None else shipped_weights(), KIND)
     return (own, *(checksum for m in models for checksum in m.checksums))
 
 
-def transport(obj: TranslucentObject, path: str | os.PathLike | None = None) -> NeuralShape:
+def transport(obj: TranslucentObject, path: str | os.PathLike[str] | None = None) -> NeuralShape:
     """The model of an object, by the shipped weights or others, held to the light that leaves by walks.
     ValueError if the file cannot be used, or the medium varies or is out of the range of `neural`."""
     if obj.varying is not None:

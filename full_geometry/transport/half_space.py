@@ -67,7 +67,7 @@ class HalfSpaceTransport(Transport):
         return HalfSpaceTransport(models, self.geometry, True)
 
 
-def in_double(query: tuple) -> tuple:
+def in_double(query: tuple[mi.Float, ...]) -> tuple[mi.Float, ...]:
     """A query in double precision on CUDA: single ones networks answer there in half, which differences enlarge."""
     kind = dr.expr_t(*query)
     if dr.backend_v(kind) != dr.JitBackend.CUDA:

@@ -306,7 +306,9 @@ def weights_name(identity: Identity) -> str:
     return f"{name}.safetensors"
 
 
-def save(folder: str | os.PathLike, identity: Identity, arrays: dict[str, np.ndarray], record: dict[str, Any]) -> Path:
+def save(
+    folder: str | os.PathLike[str], identity: Identity, arrays: dict[str, np.ndarray], record: dict[str, Any]
+) -> Path:
     """Write the weights of an object and their record; returns the path."""
     whole = {"orders": "multiple", "reflections": REFLECTIONS, **identity.record(), **record}
     bound = {"anchors": identity.anchors.astype(np.float32)}
@@ -315,7 +317,7 @@ def save(folder: str | os.PathLike, identity: Identity, arrays: dict[str, np.nda
     return save_weights(path_of(folder) / weights_name(identity), KIND, {**arrays, **bound}, whole)
 
 
-def find_weights(obj: TranslucentObject, folder: str | os.PathLike | None = None) -> Path:
+def find_weights(obj: TranslucentObject, folder: str | os.PathLike[str] | None = None) -> Path:
     """The file of weights of an object.
     ValueError if there is none, which says what tells the object from the nearest one that was trained."""
     here = identify(obj)
@@ -348,7 +350,7 @@ MOST_APART = 1.0  # media of a neighbour, see `_apart`
 
 
 def nearest(
-    obj: TranslucentObject, recipe: Mapping[str, Any], folder: str | os.PathLike | None = None
+    obj: TranslucentObject, recipe: Mapping[str, Any], folder: str | os.PathLike[str] | None = None
 ) -> Neighbour | None:
     """Weights of the same shape with the medium that is most alike, from which a training may start; None without any.
     `obj`: the object; weights are of homogeneous media with nothing inside. `recipe`: of its training; sizes and base
@@ -424,7 +426,7 @@ def _checked_base(path: Path, record: dict[str, Any], obj: TranslucentObject) ->
     return name
 
 
-def load(path: str | os.PathLike, obj: TranslucentObject) -> Learnt:
+def load(path: str | os.PathLike[str], obj: TranslucentObject) -> Learnt:
     """The model of an object and its sampler from its weights.
     ValueError if the file is damaged, of another kind or version, or of another object."""
     path = Path(path)

@@ -12,6 +12,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -29,7 +30,12 @@ POSE, VERTICES, NORMALS = ".to_world", ".vertex_positions", ".vertex_normals"
 
 
 def frames(
-    scene: mi.Scene | dict | str | Path, rows: str | Path | Rows, *, sensor: int = 0, spp: int = 0, seed: int = 0
+    scene: mi.Scene | dict[str, Any] | str | Path,
+    rows: str | Path | Rows,
+    *,
+    sensor: int = 0,
+    spp: int = 0,
+    seed: int = 0,
 ) -> Iterator[np.ndarray]:
     """Images (H, W, channels) of a scene, one for each row of edits, by its integrator.
 

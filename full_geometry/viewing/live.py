@@ -84,7 +84,7 @@ class LiveScene:
         ValueError: as `open_scene`, or the scene has no sensor.
     """
 
-    def __init__(self, scene: dict | str | Path, parameters: Mapping[str, str] | None = None) -> None:
+    def __init__(self, scene: dict[str, Any] | str | Path, parameters: Mapping[str, str] | None = None) -> None:
         self.source, self._parameters = scene, dict(parameters or {})
         self.file = None if isinstance(scene, dict) else Path(scene).resolve()
         self.folder = Path.cwd() if self.file is None else self.file.parent

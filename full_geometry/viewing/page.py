@@ -58,7 +58,7 @@ class Page:
     """
 
     def __init__(
-        self, scene: dict | str | Path, host: str = "127.0.0.1", port: int = 0, pixels: int = PIXELS,
+        self, scene: dict[str, Any] | str | Path, host: str = "127.0.0.1", port: int = 0, pixels: int = PIXELS,
         parameters: dict[str, str] | None = None,
     ) -> None:  # fmt: skip
         try:
@@ -174,7 +174,7 @@ class Page:
             screen.restart()
 
 
-def view(scene: dict | str | Path, **options: object) -> Page:
+def view(scene: dict[str, Any] | str | Path, **options: object) -> Page:
     """Serve a scene to browsers, and in a notebook show it below the cell; `Page.close` ends it.
     `scene`: the path of an XML file, or a dict as for `mitsuba.load_dict`. `options`: as of `Page`."""
     return Page(scene, **options)

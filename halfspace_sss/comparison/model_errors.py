@@ -8,7 +8,7 @@ blocks, which is stated with it.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
@@ -322,7 +322,7 @@ def reference_maps(
 
 HELD_OUT_SEED = 15485863
 GRID, BLOCK = CellGrid(40, 16), 4
-BANDS = {
+BANDS: dict[str, Callable[[pandas.DataFrame], pandas.Series]] = {
     "albedo < 0.5": lambda t: t["albedo"] < 0.5,
     "albedo 0.5-0.9": lambda t: (t["albedo"] >= 0.5) & (t["albedo"] < 0.9),
     "albedo 0.9-0.99": lambda t: (t["albedo"] >= 0.9) & (t["albedo"] < 0.99),

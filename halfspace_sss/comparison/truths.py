@@ -9,9 +9,11 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 
+from halfspace_sss.arrays import Lanes
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_cosine, check_count
 from halfspace_sss.physics.fresnel import F_r
@@ -250,15 +252,16 @@ class Validation:
 class OrderTally(Tally):
     """Flux through the boundary after exactly `order` scattering events."""
 
-    def __init__(self, types: object, order: int) -> None:
-        self.types, self.order = types, order
+    def __init__(self, types: ModuleType, order: int) -> None:
+        self.types = types
+        self.order = order
 
-    def start(self, lanes: int) -> tuple:
+    def start(self, lanes: int) -> tuple[Lanes, ...]:
         import drjit as dr
 
         return (dr.zeros(self.types.Float, lanes),)
 
-    def boundary(self, sums: tuple, event: Boundary) -> tuple:
+    def boundary(self, sums: tuple[Lanes, ...], event: Boundary) -> tuple[Lanes, ...]:
         import drjit as dr
 
         return (sums[0] + dr.select(event.order == self.order, event.weight, 0.0),)

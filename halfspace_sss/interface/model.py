@@ -274,16 +274,16 @@ class RadialSampler:
         top = max(float(mass.max()), 1e-300)
         beyond = np.nonzero(mass > 1e-7 * top)[0]
         r_max = r[min(beyond[-1] + 1, len(r) - 1)] if len(beyond) else 1.0
-        self.edges = np.concatenate([[0.0], np.geomspace(R_MIN, r_max, n_cells)])
+        self.edges: np.ndarray = np.concatenate([[0.0], np.geomspace(R_MIN, r_max, n_cells)])
         middle = np.concatenate([[0.5 * R_MIN], np.sqrt(self.edges[1:-1] * self.edges[2:])])
         weight = middle * _profile(S, middle) * np.diff(self.edges)
         if not weight.sum() > 0:
             weight = np.diff(np.log(np.maximum(self.edges, 0.5 * R_MIN)))
         probability = np.append((1 - TAIL_MASS) * weight / weight.sum(), TAIL_MASS)
-        self.cdf = np.concatenate([[0.0], np.cumsum(probability)])
+        self.cdf: np.ndarray = np.concatenate([[0.0], np.cumsum(probability)])
         self.cdf[-1] = 1.0
-        self.probability = np.diff(self.cdf)
-        self.width = np.append(np.diff(self.edges), r_max)
+        self.probability: np.ndarray = np.diff(self.cdf)
+        self.width: np.ndarray = np.append(np.diff(self.edges), r_max)
         self.r_max = r_max
 
     def sample(self, lib: Library, u: Real) -> Real:
@@ -320,7 +320,7 @@ BLOCK_BYTES = 1 << 27  # that torch keeps of one block
 PROBE = 64  # queries
 
 
-def recorded_in_blocks(lib: Library, f: Callable[..., Real], args: tuple) -> Real:
+def recorded_in_blocks(lib: Library, f: Callable[..., Real], args: tuple[Real, ...]) -> Real:
     """f(*args), a function of each query alone, so that torch keeps the arguments for its derivatives and no more.
     torch keeps what every operation was given, tens of kB a query where a model integrates. Queries that would exceed
     `BLOCK_BYTES` are therefore split, and each block is recorded when it is gone through backwards. Other libraries,

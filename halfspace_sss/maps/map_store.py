@@ -121,7 +121,7 @@ Unit = tuple[str, int, MapUnit]  # name of the medium, channel, and what is trac
 
 def make_maps(
     media: Mapping[str, Medium],
-    folder: str | os.PathLike,
+    folder: str | os.PathLike[str],
     *,
     grid: MapGrid | None = None,
     target_error: float | None = 0.05,
@@ -374,7 +374,7 @@ def _write(path: Path, channel: int, theta: int, result: UnitResult) -> None:
         xr.Dataset({"checksum": (dims[:2], checksum)}).to_zarr(**_at(path), region=region, mode="r+")
 
 
-def load_maps(path: str | os.PathLike) -> xr.Dataset:
+def load_maps(path: str | os.PathLike[str]) -> xr.Dataset:
     """Load a finished store of `make_maps` and check every unit of it.
 
     Returns:

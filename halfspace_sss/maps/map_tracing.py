@@ -77,7 +77,7 @@ class MapTally(Tally):
     n_psi: int
     phase: Callable[[Lanes, Scatter, Lanes], Lanes]
     g: Lanes
-    directions: list[tuple]
+    directions: list[tuple[Lanes, ...]]
     inverse_scale: Lanes
     low: Lanes
     rate: Lanes
@@ -87,7 +87,7 @@ class MapTally(Tally):
         names = ("g", "directions", "inverse_scale", "low", "rate")
         return replace(self, **{name: at_lanes(getattr(self, name), lanes) for name in names})
 
-    def scatter(self, sums: tuple, event: Scatter) -> tuple:
+    def scatter(self, sums: tuple[Lanes, ...], event: Scatter) -> tuple[Lanes, ...]:
         # contributions towards all observations, q_k = p(d . d_k) exp(-z / mu_k) / (eta² mu_k)
         q = []
         for ox, oy, mu, inverse_mu, scale in self.directions:

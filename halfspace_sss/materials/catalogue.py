@@ -53,7 +53,7 @@ class Registry:
             raise ValueError(f"material must be one of the {len(materials)} registered, got {name!r}{hint}")
         return materials[key_of(name)]
 
-    def register(self, material_or_path: Material | str | os.PathLike) -> tuple[str, ...]:
+    def register(self, material_or_path: Material | str | os.PathLike[str]) -> tuple[str, ...]:
         """Add a material, or those of a TOML file or folder; returns their names."""
         if isinstance(material_or_path, Material):
             results = [(IN_CODE, material_or_path)]
@@ -131,7 +131,7 @@ def _user_folder() -> Path:
     return Path(os.environ.get(variable) or Path.home() / default) / "halfspace-sss" / "materials"
 
 
-def _from_path(path: str | os.PathLike) -> Iterator[tuple[str, Material]]:
+def _from_path(path: str | os.PathLike[str]) -> Iterator[tuple[str, Material]]:
     from halfspace_sss.materials.files import read
 
     path = Path(path)
@@ -184,7 +184,7 @@ def load(name: str, *, dilution: float | None = None, g: float | Sequence[float]
     return material if dilution is None else material.diluted(dilution)
 
 
-def register(material_or_path: Material | str | os.PathLike) -> tuple[str, ...]:
+def register(material_or_path: Material | str | os.PathLike[str]) -> tuple[str, ...]:
     """Add a `Material`, or all materials of a TOML file or folder, for this process; returns their names.
 
     A file that is read again replaces what it gave before; an equal material may be added again.
@@ -195,7 +195,7 @@ def register(material_or_path: Material | str | os.PathLike) -> tuple[str, ...]:
     return _registry.register(material_or_path)
 
 
-def write(path: str | os.PathLike, *materials: Material) -> None:
+def write(path: str | os.PathLike[str], *materials: Material) -> None:
     """Write a material file, which `register` and the registry read again as equal materials.
 
     Args:

@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     import pygltflib
 
 CHANNELS = ("R", "G", "B")
-OPENPBR = {  # defaults of OpenPBR 1.1
+OPENPBR: dict[str, float | tuple[float, ...]] = {  # defaults of OpenPBR 1.1
     "subsurface_weight": 0.0, "subsurface_color": (0.8, 0.8, 0.8), "subsurface_radius": 1.0,
     "subsurface_radius_scale": (1.0, 0.5, 0.25), "subsurface_scatter_anisotropy": 0.0, "specular_ior": 1.5,
     "specular_weight": 1.0,
 }  # fmt: skip
-NO_MEDIUM = {  # what of OpenPBR is in no medium, with the values by which it changes nothing
+NO_MEDIUM: dict[str, float | tuple[float, ...]] = {  # in no medium; values that change nothing
     "subsurface_weight": 1.0, "base_metalness": 0.0, "transmission_weight": 0.0, "coat_weight": 0.0,
     "fuzz_weight": 0.0, "thin_film_weight": 0.0, "emission_luminance": 0.0, "geometry_opacity": 1.0,
     "specular_color": (1.0, 1.0, 1.0), "specular_roughness": 0.0,
@@ -35,7 +35,7 @@ ROUGHNESS = 0.3  # of OpenPBR 1.1 where none is written
 TAKEN_OF_GLTF = ("KHR_materials_volume_scatter", "KHR_materials_volume", "KHR_materials_ior")
 WEIGHED = ("base", "transmission", "coat", "fuzz", "thin_film", "emission")  # groups of inputs, each with a weight
 THIN = "a thin wall has no inside, whose light a medium could be"
-TO_REC709 = {  # linear, by the name of a colour space in MaterialX
+TO_REC709: dict[str, np.ndarray] = {  # linear, by the name of a colour space in MaterialX
     "": np.eye(3),
     "lin_rec709": np.eye(3),
     "acescg": np.array(  # AP1 with the white of ACES to Rec. 709 with D65, Bradford adaptation
@@ -160,7 +160,7 @@ def read_gltf(path: Path) -> pygltflib.GLTF2:
         raise ValueError(f"{path}: must be a glTF file, got {type(error).__name__}: {error}") from error
 
 
-def gltf_medium(parts: dict[str, dict], unit: float = 1000.0) -> Medium | None:
+def gltf_medium(parts: dict[str, dict[str, object]], unit: float = 1000.0) -> Medium | None:
     """The medium of a material of glTF by its extensions, None where it does not scatter.
 
     Args:

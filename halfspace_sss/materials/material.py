@@ -94,7 +94,7 @@ class Material:
         """The table of the medium under name, set and source."""
         return f"<p>{escape(f'{self.name}, {self.set}: {self.source}')}</p>{self.medium._repr_html_()}"
 
-    def __getstate__(self) -> dict:
+    def __getstate__(self) -> dict[str, object]:
         return {**self.__dict__, "sources": dict(self.sources)}
 
     def diluted(self, fraction: float) -> Material:

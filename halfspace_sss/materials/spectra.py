@@ -99,7 +99,7 @@ class SpectralMedium:
             _check(name, value, ok, wavelengths, bound)
             object.__setattr__(self, name, value)
 
-    def to_csv(self, path: str | os.PathLike) -> None:
+    def to_csv(self, path: str | os.PathLike[str]) -> None:
         """Write the spectra in 1/mm with all their digits, as `read_spectra` reads them."""
         columns = (self.wavelengths, self.sigma_a, self.sigma_s, self.g, self.n)
         rows = [",".join(COLUMNS), *(",".join(map(repr, row)) for row in np.transpose(columns).tolist())]
@@ -212,7 +212,7 @@ def _observer() -> tuple[np.ndarray, np.ndarray]:
     return rows[:, 0], (rows[:, 1:4] * rows[:, 4:]).T
 
 
-def read_spectra(path: str | os.PathLike, unit: str | None = None) -> SpectralMedium:
+def read_spectra(path: str | os.PathLike[str], unit: str | None = None) -> SpectralMedium:
     """Spectra of a CSV file with the columns wavelength (nm), mu_a, mu_s, g and n; lines that begin with # are skipped.
 
     A column mu_s' (or mu_s_prime) in place of mu_s is reduced scattering: mu_s = mu_s' / (1 - g).

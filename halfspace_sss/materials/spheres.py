@@ -20,7 +20,12 @@ from halfspace_sss.provenance import read_text
 
 NODES = 32  # of the solver: reflectance of a slab to 1e-5 for g up to 0.9
 HEADER = 17  # numbers before the kind of rows
-KINDS = {1: ("M_R",), 2: ("M_R", "M_T"), 3: ("M_R", "M_T", "M_U"), 5: ("M_R", "M_T", "M_U", "r_w", "t_w")}
+KINDS: dict[int, tuple[str, ...]] = {
+    1: ("M_R",),
+    2: ("M_R", "M_T"),
+    3: ("M_R", "M_T", "M_U"),
+    5: ("M_R", "M_T", "M_U", "r_w", "t_w"),
+}
 LARGEST = 1e3  # optical thickness, absorbed or reduced scattered, of a fit
 
 

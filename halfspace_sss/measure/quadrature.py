@@ -48,15 +48,18 @@ class Angles:
     """
 
     def __init__(self, evaluate: Evaluate, medium: Medium, q: Quadrature, probe: Evaluate | None = None) -> None:
-        self.evaluate, self.medium = evaluate, medium
+        self.mu_o: np.ndarray
+        self.w_mu: np.ndarray
+        self.evaluate = evaluate
+        self.medium = medium
         self.mu_o, self.w_mu = cosine_nodes(medium.eta, q.n_mu)
-        self.phi_o = 2 * math.pi * (np.arange(q.n_azimuth) + 0.5) / q.n_azimuth
+        self.phi_o: np.ndarray = 2 * math.pi * (np.arange(q.n_azimuth) + 0.5) / q.n_azimuth
         half = q.n_azimuth // 2
-        self.phi_i = math.pi * np.arange(half + 1) / half
-        self.w_i = np.r_[0.5, np.ones(half - 1), 0.5] / half
-        self.w_x = -self.w_i * np.cos(self.phi_i)
+        self.phi_i: np.ndarray = math.pi * np.arange(half + 1) / half
+        self.w_i: np.ndarray = np.r_[0.5, np.ones(half - 1), 0.5] / half
+        self.w_x: np.ndarray = -self.w_i * np.cos(self.phi_i)
         free_i, free_o = self._unused_azimuths(probe or evaluate)
-        self.both_azimuths = not (free_i or free_o)
+        self.both_azimuths: bool = not (free_i or free_o)
         if not self.both_azimuths:
             self._merge_exits(probe or evaluate)
         if free_i:

@@ -13,6 +13,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from halfspace_sss.backend import BackendError
+from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.lazy import lazy_names
 from halfspace_sss.neural.material_model import NeuralMaterial
 from halfspace_sss.neural.paper_model import NeuralPaper
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = ["MODELS", "Neural", "NeuralMaterial", "NeuralPaper", "train", "train_universal"]
 
-MODELS = [Neural, NeuralMaterial, NeuralPaper]
+MODELS: list[type[BSSRDF]] = [Neural, NeuralMaterial, NeuralPaper]
 
 TRAININGS = {"training.train_material": ["train"], "training.train_universal": ["train_universal"]}
 _found, __dir__ = lazy_names(__name__, TRAININGS)

@@ -45,4 +45,6 @@ class NeuralMaterial(SymmetricModel):
 
     def __init__(self, medium: Medium) -> None:
         super().__init__(medium)
-        self.networks = [load_network(find_weights(KIND, m), KIND, m, N_FEATURES) for m in channels(medium)]
+        self.networks: list[Network] = [
+            load_network(find_weights(KIND, m), KIND, m, N_FEATURES) for m in channels(medium)
+        ]

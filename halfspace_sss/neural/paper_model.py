@@ -63,7 +63,9 @@ class NeuralPaper(BSSRDF):
 
     def __init__(self, medium: Medium, trained: Sequence[tuple[Network, float]] | None = None) -> None:
         super().__init__(medium)
-        self.trained = trained or [_load(find_weights(KIND, m), m) for m in channels(medium)]
+        self.trained: Sequence[tuple[Network, float]] = trained or [
+            _load(find_weights(KIND, m), m) for m in channels(medium)
+        ]
 
     @property
     def checksums(self) -> tuple[str, ...]:

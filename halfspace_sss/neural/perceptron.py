@@ -65,8 +65,10 @@ class Perceptron:
         looped: bool = False,
     ) -> None:
         self.looped = looped
-        self.parts = np.split(np.asarray(matrices[0]), list(splits), axis=1)
-        self.matrices, self.biases, self.activation = [*self.parts, *matrices[1:]], list(biases), activation
+        self.parts: list[np.ndarray] = np.split(np.asarray(matrices[0]), list(splits), axis=1)
+        self.matrices: list[np.ndarray] = [*self.parts, *matrices[1:]]
+        self.biases: list[np.ndarray] = list(biases)
+        self.activation = activation
         self._packed: dict[type, tuple[list, list]] = {}  # by type of vector, so of each backend
 
     @classmethod

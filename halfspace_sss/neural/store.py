@@ -57,7 +57,7 @@ def record_number(path: Path, record: JsonDict, key: str, low: float, high: floa
     return float(record[key])
 
 
-def save_weights(path: str | os.PathLike, kind: str, arrays: Mapping[str, np.ndarray], record: JsonDict) -> Path:
+def save_weights(path: str | os.PathLike[str], kind: str, arrays: Mapping[str, np.ndarray], record: JsonDict) -> Path:
     """Write `path` (.safetensors) and its record (.json); together or not at all.
     `kind`: which network it is, e.g. "neural_material". `arrays`: name -> float array. `record`: what else is known:
     medium, architecture, data, error, time, versions; ready for JSON. ValueError if the name does not end in
@@ -76,7 +76,7 @@ def save_weights(path: str | os.PathLike, kind: str, arrays: Mapping[str, np.nda
     return path
 
 
-def load_weights(path: str | os.PathLike, kind: str) -> tuple[dict[str, np.ndarray], JsonDict]:
+def load_weights(path: str | os.PathLike[str], kind: str) -> tuple[dict[str, np.ndarray], JsonDict]:
     """Arrays and record of a file of weights.
     ValueError if it is no such file, is truncated or altered, of another kind, version or shape, or holds numbers that
     are not finite; the message names the file."""
@@ -91,7 +91,7 @@ def load_weights(path: str | os.PathLike, kind: str) -> tuple[dict[str, np.ndarr
     return _arrays(path, data, record), record
 
 
-def checksum_of(path: str | os.PathLike, kind: str) -> str:
+def checksum_of(path: str | os.PathLike[str], kind: str) -> str:
     """SHA-256 of the arrays of a file of weights, as its record names it; errors as in `load_weights`."""
     return _read_record(path_of(path), kind)["sha256"]
 

@@ -186,11 +186,11 @@ class Neural(SymmetricModel):
     def __init__(self, medium: Medium, weights: Path | None = None) -> None:
         super().__init__(medium)
         check_range(medium)
-        self.weights = weights or shipped_weights()
+        self.weights: Path = weights or shipped_weights()
         hyper = load_hypernetwork(self.weights)
         ratios = [(m.albedo, m.g, m.eta) for m in channels(medium)]
-        self.networks = [hyper.network(*one) for one in ratios]
-        self.calibrations = [hyper.calibration(*one) for one in ratios]
+        self.networks: list[Network] = [hyper.network(*one) for one in ratios]
+        self.calibrations: list[tuple[float, ...]] = [hyper.calibration(*one) for one in ratios]
 
     @property
     def trained(self) -> str:

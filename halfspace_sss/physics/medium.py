@@ -14,7 +14,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from halfspace_sss.arrays import Real, is_torch, library
+from halfspace_sss.arrays import PerChannel, Real, is_torch, library
 from halfspace_sss.physics.reflectance import DIFFUSE, albedo_of_reflectance, half_space_reflectance
 
 INDICES = (0.01, 100.0)  # relative: beyond, Fresnel's moments lose their digits
@@ -148,7 +148,7 @@ class Medium:
         _check("sigma_t = sigma_s + sigma_a", sigma_t, ok, f"{bound} (1/mm)", hint)
 
     @classmethod
-    def from_albedo(cls, albedo, sigma_t, g=0.0, eta=1.3) -> Medium:
+    def from_albedo(cls, albedo: PerChannel, sigma_t: PerChannel, g: PerChannel = 0.0, eta: float = 1.3) -> Medium:
         """The medium with single-scattering albedo in [0, 1] and extinction sigma_t (1/mm).
 
         sigma_s = albedo sigma_t, sigma_a = (1 - albedo) sigma_t.
@@ -160,7 +160,9 @@ class Medium:
         return cls(albedo * sigma_t, (1 - albedo) * sigma_t, g, eta)
 
     @classmethod
-    def from_reduced(cls, sigma_s_prime, sigma_a, g=0.0, eta=1.3) -> Medium:
+    def from_reduced(
+        cls, sigma_s_prime: PerChannel, sigma_a: PerChannel, g: PerChannel = 0.0, eta: float = 1.3
+    ) -> Medium:
         """The medium whose reduced scattering is sigma_s_prime (1/mm): sigma_s = sigma_s_prime / (1 - g)."""
         sigma_s_prime, g = _coefficients(sigma_s_prime=sigma_s_prime, g=g).values()
         ok = library(sigma_s_prime).isfinite(sigma_s_prime) & (sigma_s_prime >= 0)
@@ -170,7 +172,14 @@ class Medium:
         return cls(sigma_s_prime / (1 - g), sigma_a, g, eta)
 
     @classmethod
-    def from_reflectance(cls, reflectance, mfp, g=0.0, eta=1.3, mu_i=DIFFUSE) -> Medium:
+    def from_reflectance(
+        cls,
+        reflectance: PerChannel,
+        mfp: PerChannel,
+        g: PerChannel = 0.0,
+        eta: float = 1.3,
+        mu_i: float | str = DIFFUSE,
+    ) -> Medium:
         """The medium whose half-space has a wanted reflectance, with the mean free path mfp = 1 / sigma_t (mm).
 
         A mean free path of 0 in some channels is their diffuse limit, see `diffuse_limit`.
@@ -196,8 +205,9 @@ class Medium:
 
     @classmethod
     def from_openpbr(
-        cls, subsurface_color, subsurface_radius=1.0, subsurface_radius_scale=(1.0, 0.5, 0.25),
-        subsurface_scatter_anisotropy=0.0, specular_ior=1.5, mm_per_unit=1.0,
+        cls, subsurface_color: PerChannel, subsurface_radius: PerChannel = 1.0,
+        subsurface_radius_scale: PerChannel = (1.0, 0.5, 0.25), subsurface_scatter_anisotropy: PerChannel = 0.0,
+        specular_ior: float = 1.5, mm_per_unit: float = 1.0,
     ) -> Medium:  # fmt: skip
         """The medium of the subsurface slab of OpenPBR 1.1, in linear Rec. 709.
 
@@ -224,8 +234,8 @@ class Medium:
 
     @classmethod
     def from_principled(
-        cls, base_color, subsurface_radius=(1.0, 0.2, 0.1), subsurface_scale=0.05, subsurface_anisotropy=0.0, ior=1.5,
-        mm_per_unit=1000.0,
+        cls, base_color: PerChannel, subsurface_radius: PerChannel = (1.0, 0.2, 0.1), subsurface_scale: float = 0.05,
+        subsurface_anisotropy: PerChannel = 0.0, ior: float = 1.5, mm_per_unit: float = 1000.0,
     ) -> Medium:  # fmt: skip
         """The medium of the Principled BSDF of Blender 4 with the method Random Walk, in linear Rec. 709.
 
@@ -244,8 +254,9 @@ class Medium:
 
     @classmethod
     def from_gltf(
-        cls, multiscatter_color, attenuation_distance, attenuation_color, scatter_anisotropy=0.0, ior=1.5
-    ) -> Medium:
+        cls, multiscatter_color: PerChannel, attenuation_distance: float, attenuation_color: PerChannel,
+        scatter_anisotropy: float = 0.0, ior: float = 1.5,
+    ) -> Medium:  # fmt: skip
         """The medium of KHR_materials_volume_scatter with KHR_materials_volume of glTF, in linear Rec. 709.
 
         The extensions define the coefficients, not what is seen: sigma_t = -ln(attenuation_color) /
@@ -267,7 +278,7 @@ class Medium:
         s = 4.09712 + 4.20863 * color - np.sqrt(9.59217 + 41.6808 * color + 17.7126 * color**2)
         return cls.from_albedo(np.clip(1 - s * s, 0, 1), -np.log(tint) / (1000 * distance), scatter_anisotropy, ior)
 
-    def reflectance(self, mu_i: float | str = DIFFUSE):
+    def reflectance(self, mu_i: float | str = DIFFUSE) -> np.ndarray | float:
         """The fraction of incident flux that comes back out of the half-space, per channel, all orders.
 
         mu_i is the cosine of incidence, or "diffuse" for uniform radiance from above. Exact by discrete
@@ -284,32 +295,32 @@ class Medium:
         return len(self.sigma_s) if np.ndim(self.sigma_s) else None
 
     @property
-    def sigma_t(self):
+    def sigma_t(self) -> np.ndarray | float:
         """Extinction coefficient sigma_s + sigma_a, 1/mm."""
         return self.sigma_s + self.sigma_a
 
     @property
-    def mfp(self):
+    def mfp(self) -> np.ndarray | float:
         """Mean free path 1 / sigma_t, mm."""
         return 1 / self.sigma_t
 
     @property
-    def albedo(self):
+    def albedo(self) -> np.ndarray | float:
         """Single-scattering albedo sigma_s / sigma_t."""
         return self.sigma_s / self.sigma_t
 
     @property
-    def sigma_s_prime(self):
+    def sigma_s_prime(self) -> np.ndarray | float:
         """Reduced scattering coefficient (1 - g) sigma_s, 1/mm."""
         return (1 - self.g) * self.sigma_s
 
     @property
-    def sigma_t_prime(self):
+    def sigma_t_prime(self) -> np.ndarray | float:
         """Reduced extinction coefficient sigma_s_prime + sigma_a, 1/mm."""
         return self.sigma_s_prime + self.sigma_a
 
     @property
-    def albedo_prime(self):
+    def albedo_prime(self) -> np.ndarray | float:
         """Reduced albedo sigma_s_prime / sigma_t_prime."""
         return self.sigma_s_prime / self.sigma_t_prime
 

@@ -55,7 +55,7 @@ class Ring:
         return self.inner, self.outer
 
     @staticmethod
-    def seen(x: Lanes, y: Lanes, lengths: tuple, symmetric: bool) -> Lanes:
+    def seen(x: Lanes, y: Lanes, lengths: tuple[Lanes, ...], symmetric: bool) -> Lanes:
         """Share of the light at (x, y) that lies on the detector, lengths in the unit of x and y."""
         r2, (inner, outer) = x * x + y * y, lengths
         return dr.select((r2 >= inner * inner) & (r2 < outer * outer), type(x)(1), 0.0)
@@ -91,7 +91,7 @@ class Fibre:
         return self.x, self.y, math.hypot(self.x, self.y), self.radius
 
     @staticmethod
-    def seen(x: Lanes, y: Lanes, lengths: tuple, symmetric: bool) -> Lanes:
+    def seen(x: Lanes, y: Lanes, lengths: tuple[Lanes, ...], symmetric: bool) -> Lanes:
         """As `Ring.seen`; light of a beam along the normal counts by the share of its circle that the core covers."""
         at_x, at_y, d, radius = lengths
         if symmetric:
@@ -143,11 +143,12 @@ class PathTally(Tally):
     """Flux by place and path length; cells (ring or elsewhere, length), lengths between edges or logarithmic."""
 
     def __init__(self, types: ModuleType, edges2: Lanes | None, lengths: np.ndarray | None) -> None:
-        self.edges2, self.lengths = edges2, None if lengths is None else aligned(types.Float, lengths)
-        self.n = len(log_lengths()) + 1 if lengths is None else len(lengths) - 1
-        self.cells = CellSums(types, _places(edges2) * self.n)
+        self.edges2 = edges2
+        self.lengths: Lanes | None = None if lengths is None else aligned(types.Float, lengths)
+        self.n: int = len(log_lengths()) + 1 if lengths is None else len(lengths) - 1
+        self.cells: CellSums = CellSums(types, _places(edges2) * self.n)
 
-    def boundary(self, sums: tuple, event: Boundary) -> tuple:
+    def boundary(self, sums: tuple[Lanes, ...], event: Boundary) -> tuple[Lanes, ...]:
         if self.lengths is None:
             at = (dr.log(dr.maximum(event.length, SHORTEST)) - math.log(SHORTEST)) * (1 / LOG_STEP) + 1
             at = dr.select(event.length < SHORTEST, 0, dr.minimum(at, self.n - 1))
@@ -166,17 +167,19 @@ class DepthTally(Tally):
     """
 
     def __init__(self, types: ModuleType, edges2: Lanes | None, depths: np.ndarray) -> None:
-        self.Float = types.Float
-        self.edges2, self.depths, self.n = edges2, aligned(types.Float, depths), len(depths) - 1
-        self.cells = CellSums(types, _places(edges2) * self.n)
+        self.edges2 = edges2
+        self.Float: type[Lanes] = types.Float
+        self.depths: Lanes = aligned(types.Float, depths)
+        self.n: int = len(depths) - 1
+        self.cells: CellSums = CellSums(types, _places(edges2) * self.n)
 
-    def start(self, lanes: int) -> tuple:
+    def start(self, lanes: int) -> tuple[Lanes, ...]:
         return tuple(dr.zeros(self.Float, lanes) for _ in range(3))
 
-    def boundary(self, sums: tuple, event: Boundary) -> tuple:
+    def boundary(self, sums: tuple[Lanes, ...], event: Boundary) -> tuple[Lanes, ...]:
         return sums[0] + event.weight * sums[2], sums[1] + event.weight, sums[2]
 
-    def scatter(self, sums: tuple, event: Scatter) -> tuple:
+    def scatter(self, sums: tuple[Lanes, ...], event: Scatter) -> tuple[Lanes, ...]:
         depth, inside = find_cell(self.depths, event.z)
         self.cells.add(event.weight, _place(self.edges2, event) * self.n + depth, event.lane, inside)
         return sums[0], sums[1], dr.select(event.order == 1, event.z, dr.maximum(sums[2], event.z))
@@ -186,16 +189,23 @@ class DetectorTally(Tally):
     """Flux on each detector within its aperture."""
 
     def __init__(self, types: ModuleType, detectors: Sequence[Ring | Fibre], medium: Medium, symmetric: bool) -> None:
-        self.Float, self.detectors, self.symmetric = types.Float, detectors, symmetric
+        self.detectors = detectors
+        self.symmetric = symmetric
+        self.Float: type[Lanes] = types.Float
         scale = float(medium.sigma_t)
-        self.lengths = [tuple(dr.opaque(types.Float, v * scale) for v in d.lengths()) for d in detectors]
+        self.lengths: list[tuple[Lanes, ...]] = [
+            tuple(dr.opaque(types.Float, v * scale) for v in d.lengths()) for d in detectors
+        ]
         sines = [min(d.numerical_aperture / medium.eta, 1.0) for d in detectors]
-        self.least = [dr.opaque(types.Float, math.sqrt(1 - s * s)) for s in sines]  # cosine inside, by Snell
+        self.least: list[Lanes] = [
+            dr.opaque(types.Float, math.sqrt(1 - s * s))
+            for s in sines  # cosine inside, by Snell
+        ]
 
-    def start(self, lanes: int) -> tuple:
+    def start(self, lanes: int) -> tuple[Lanes, ...]:
         return tuple(dr.zeros(self.Float, lanes) for _ in self.detectors)
 
-    def boundary(self, sums: tuple, event: Boundary) -> tuple:
+    def boundary(self, sums: tuple[Lanes, ...], event: Boundary) -> tuple[Lanes, ...]:
         found = []
         for total, detector, lengths, least in zip(sums, self.detectors, self.lengths, self.least):
             value = event.weight * detector.seen(event.x, event.y, lengths, self.symmetric)
@@ -227,12 +237,16 @@ class Recorder:
     def __init__(
         self, instrument: Instrument, types: ModuleType, medium: Medium, mu_i: float, radii: np.ndarray | None
     ) -> None:
-        self.instrument, self.types, self.medium, self.radii = instrument, types, medium, radii
-        self.symmetric, self.sigma_t = mu_i == 1, float(medium.sigma_t)
+        self.instrument = instrument
+        self.types = types
+        self.medium = medium
+        self.radii = radii
+        self.symmetric: bool = mu_i == 1
+        self.sigma_t: float = float(medium.sigma_t)
         if instrument.depths is not None and not medium.albedo > 0:
             raise ValueError("depths must be left out of a medium with albedo 0, where nothing scatters, got depths")
         sigma = 0.5 * instrument.beam_radius * self.sigma_t  # exp(-2 r² / w²) is normal with the deviation w/2
-        self.spot = (sigma / max(mu_i, 1e-6), sigma) if sigma > 0 else None
+        self.spot: tuple[float, float] | None = (sigma / max(mu_i, 1e-6), sigma) if sigma > 0 else None
         self.parts: dict[str, list[np.ndarray]] = {}
 
     def tallies(self) -> list[Tally]:

@@ -38,10 +38,10 @@ class FluxTally(Tally):
     def __init__(self, types: ModuleType) -> None:
         self.types = types
 
-    def start(self, lanes: int) -> tuple:
+    def start(self, lanes: int) -> tuple[Lanes, ...]:
         return (dr.zeros(self.types.Float, lanes), dr.zeros(self.types.Float, lanes))
 
-    def boundary(self, sums: tuple, event: Boundary) -> tuple:
+    def boundary(self, sums: tuple[Lanes, ...], event: Boundary) -> tuple[Lanes, ...]:
         return tuple(s + v for s, v in zip(sums, _split(event.order, event.weight)))
 
 
@@ -51,10 +51,10 @@ class MomentTally(Tally):
     def __init__(self, types: ModuleType) -> None:
         self.types = types
 
-    def start(self, lanes: int) -> tuple:
+    def start(self, lanes: int) -> tuple[Lanes, ...]:
         return tuple(dr.zeros(self.types.Float, lanes) for _ in range(6))
 
-    def boundary(self, sums: tuple, event: Boundary) -> tuple:
+    def boundary(self, sums: tuple[Lanes, ...], event: Boundary) -> tuple[Lanes, ...]:
         leaves = event.weight > 0
         moments = (event.x * event.x + event.y * event.y, event.x, event.length)
         values = [dr.select(leaves, event.weight * m, 0.0) for m in moments]
@@ -68,18 +68,18 @@ class AngularTally(Tally):
 
     def __init__(self, types: ModuleType, g: float, eta: float, mu_o: np.ndarray, delta_phi: np.ndarray) -> None:
         self.types = types
-        self.g = g if g == 0 else dr.opaque(types.Float, g)
-        self.mu = np.array([max(float(mu_internal(m, eta)), 1e-9) for m in mu_o])
+        self.g: float | Lanes = g if g == 0 else dr.opaque(types.Float, g)
+        self.mu: np.ndarray = np.array([max(float(mu_internal(m, eta)), 1e-9) for m in mu_o])
         sine = np.sqrt(np.maximum(1 - self.mu**2, 0))
-        self.constants = [
+        self.constants: list[tuple[Lanes, ...]] = [
             tuple(dr.opaque(types.Float, v) for v in (s * math.cos(p), s * math.sin(p), m, 1 / m, 1 / (eta**2 * m)))
             for s, p, m in zip(sine, delta_phi, self.mu)
         ]
 
-    def start(self, lanes: int) -> tuple:
+    def start(self, lanes: int) -> tuple[Lanes, ...]:
         return tuple(dr.zeros(self.types.Float, lanes) for _ in range(2 * len(self.mu)))
 
-    def scatter(self, sums: tuple, event: Scatter) -> tuple:
+    def scatter(self, sums: tuple[Lanes, ...], event: Scatter) -> tuple[Lanes, ...]:
         out = []
         for k, (ox, oy, mu, inverse_mu, scale) in enumerate(self.constants):
             cosine = event.dx * ox + event.dy * oy - event.dz * mu
@@ -93,9 +93,10 @@ class CellSums:
     """Fixed-point sums over cells, separately for each batch of lanes."""
 
     def __init__(self, types: ModuleType, cells: int, batches: int = BATCHES) -> None:
-        self.cells, self.batches = cells, batches
-        self.UInt64 = types.UInt64
-        self.sums = dr.zeros(types.UInt64, cells * batches)
+        self.cells = cells
+        self.batches = batches
+        self.UInt64: type[Lanes] = types.UInt64
+        self.sums: Lanes = dr.zeros(types.UInt64, cells * batches)
         dr.eval(self.sums)
 
     def add(self, value: Lanes, cell: Lanes, lane: Lanes, active: Lanes) -> None:
@@ -112,11 +113,11 @@ class RingTally(Tally):
     """Flux through rings of the plane between consecutive radii; cells (order, ring)."""
 
     def __init__(self, types: ModuleType, edges: np.ndarray) -> None:
-        self.n = len(edges) - 1
-        self.edges2 = aligned(types.Float, np.asarray(edges, dtype=np.float64) ** 2)
-        self.cells = CellSums(types, 2 * self.n)
+        self.n: int = len(edges) - 1
+        self.edges2: Lanes = aligned(types.Float, np.asarray(edges, dtype=np.float64) ** 2)
+        self.cells: CellSums = CellSums(types, 2 * self.n)
 
-    def boundary(self, sums: tuple, event: Boundary) -> tuple:
+    def boundary(self, sums: tuple[Lanes, ...], event: Boundary) -> tuple[Lanes, ...]:
         ring, inside = find_cell(self.edges2, event.x * event.x + event.y * event.y)
         cell = ring + (event.order > 1) * type(ring)(self.n)
         self.cells.add(event.weight, cell, event.lane, inside & (event.weight > 0))
@@ -133,16 +134,18 @@ class LineTally(Tally):
         self, types: ModuleType, angular: AngularTally, edges: np.ndarray, line_phi: float, half_width: float,
         symmetry: str,
     ) -> None:  # fmt: skip
-        self.angular, self.symmetry = angular, symmetry
+        self.angular = angular
+        self.symmetry = symmetry
         line = abs(math.remainder(line_phi, 2 * math.pi)) if symmetry == "mirror" else line_phi
-        self.line, self.half_width = (dr.opaque(types.Float, v) for v in (line, half_width))
-        self.edges2 = aligned(types.Float, np.asarray(edges, dtype=np.float64) ** 2)
-        self.cells = CellSums(types, len(edges) - 1)
+        self.line: Lanes = dr.opaque(types.Float, line)
+        self.half_width: Lanes = dr.opaque(types.Float, half_width)
+        self.edges2: Lanes = aligned(types.Float, np.asarray(edges, dtype=np.float64) ** 2)
+        self.cells: CellSums = CellSums(types, len(edges) - 1)
         low, high = max(line - half_width, 0.0), min(line + half_width, math.pi)
-        self.angle = {"rotation": 2 * math.pi, "mirror": 2 * (high - low), "none": 2 * half_width}[symmetry]
-        self.areas = 0.5 * self.angle * np.diff(np.asarray(edges, dtype=np.float64) ** 2)
+        self.angle: float = {"rotation": 2 * math.pi, "mirror": 2 * (high - low), "none": 2 * half_width}[symmetry]
+        self.areas: np.ndarray = 0.5 * self.angle * np.diff(np.asarray(edges, dtype=np.float64) ** 2)
 
-    def scatter(self, sums: tuple, event: Scatter) -> tuple:
+    def scatter(self, sums: tuple[Lanes, ...], event: Scatter) -> tuple[Lanes, ...]:
         ox, oy, mu, inverse_mu, scale = self.angular.constants[0]
         # connect the event with the surface along the refracted w_o: t = z / mu_o'
         t = event.z * inverse_mu
@@ -213,7 +216,13 @@ class Estimate(NamedTuple):
     def __rtruediv__(self, other: float | np.ndarray) -> Estimate:
         return Estimate(other, 0.0) / self
 
-    __radd__, __rmul__, __array_ufunc__ = __add__, __mul__, None  # arrays of NumPy leave the operation to it
+    def __radd__(self, other: float | np.ndarray) -> Estimate:
+        return self + other
+
+    def __rmul__(self, other: float | np.ndarray) -> Estimate:
+        return self * other
+
+    __array_ufunc__ = None  # arrays of NumPy leave the operation to it
 
 
 def _parts(other: Estimate | float | np.ndarray) -> tuple[float | np.ndarray, float | np.ndarray]:
@@ -260,7 +269,7 @@ class Pass:
     lane. `per_lane`, `n_events`: walks of each lane, scattering events of all."""
 
     tallies: list[Tally]
-    sums: tuple
+    sums: tuple[tuple[Lanes, ...], ...]
     T_i: np.ndarray
     per_lane: int
     n_events: int
@@ -295,7 +304,7 @@ def walk_passes(
     seed: Sequence[int],
     tallies: Callable[[], list[Tally]],
     progress: Progress | None = None,
-    trace: Callable[..., tuple] = walk,
+    trace: Callable[..., tuple[tuple[tuple[Lanes, ...], ...], Lanes]] = walk,
 ) -> Iterator[Pass]:
     """Trace at least `n_paths` walks, one pass after another for as long as passes are asked for.
 

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
 import drjit as dr
 import numpy as np
@@ -34,6 +34,7 @@ LAUNCH_SECONDS = 0.7  # of a kernel, in which Python hears no interrupt
 FIRST_TURNS, FEWEST_TURNS = 64, 16  # of the loop in a launch
 CUDA_FIRST_TURNS = 2048  # a few ms on a GPU, less than Python takes to record the loop
 FEW, ONE_PACKET = 0.5, 32  # share of lanes at which those that go on are put together; not below so many
+State = TypeVar("State", bound="tuple[object, ...]")  # of a loop
 
 
 @dataclass
@@ -69,7 +70,7 @@ class Scatter:
 class Tally:
     """What is recorded. Per-lane sums live in `start`'s tuple of arrays; anything else is scattered to memory."""
 
-    def start(self, lanes: int) -> tuple:
+    def start(self, lanes: int) -> tuple[Lanes, ...]:
         """Per-lane sums at zero; by default none."""
         return ()
 
@@ -77,11 +78,11 @@ class Tally:
         """The tally of some of the lanes; by default it knows nothing of lanes but by events."""
         return self
 
-    def boundary(self, sums: tuple, event: Boundary) -> tuple:
+    def boundary(self, sums: tuple[Lanes, ...], event: Boundary) -> tuple[Lanes, ...]:
         """Sums after a meeting with the surface; by default as they were."""
         return sums
 
-    def scatter(self, sums: tuple, event: Scatter) -> tuple:
+    def scatter(self, sums: tuple[Lanes, ...], event: Scatter) -> tuple[Lanes, ...]:
         """Sums after a scattering event; by default as they were."""
         return sums
 
@@ -201,8 +202,8 @@ def _put_back(whole: Any, part: Any, lanes: Lanes) -> None:
 
 
 def in_launches(
-    state: tuple, given: tuple, going: Callable[..., Lanes], body: Callable[..., tuple], label: str
-) -> tuple:
+    state: State, given: tuple[object, ...], going: Callable[..., Lanes], body: Callable[..., State], label: str
+) -> State:
     """A symbolic loop in launches of about `LAUNCH_SECONDS`; lanes go on where they were, to the last bit.
 
     A lane that has ended waits for the last one of its packet. `LAUNCH_SECONDS` after the first launch, those that go
@@ -217,7 +218,7 @@ def in_launches(
     """
     UInt32 = dr.uint32_array_t(type(going(*state)))
 
-    def launch(state: tuple, given: tuple, most: Lanes) -> tuple:
+    def launch(state: State, given: tuple[object, ...], most: Lanes) -> State:
         loop = (UInt32(0), *state)
         loop = dr.while_loop(
             loop, lambda k, *s: going(*s) & (k < most), lambda k, *s: (k + 1, *body(given, *s)), mode="symbolic",
@@ -259,7 +260,7 @@ def walk(
     tallies: Sequence[Tally],
     weight: Lanes = 1.0,
     spot: tuple[float, float] | None = None,
-) -> tuple[tuple, Lanes]:
+) -> tuple[tuple[tuple[Lanes, ...], ...], Lanes]:
     """Trace `paths_per_lane` walks one after another in each lane and return the tallies' sums and event counts.
 
     A lane that ends a walk starts the next at once, so that lanes stay busy although walks differ in length.

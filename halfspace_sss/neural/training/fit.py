@@ -244,12 +244,15 @@ class Descent:
         average: float | None = None,
         fused: bool = False,
     ) -> None:
-        self.parameters = [p for p in learner.parameters() if p.requires_grad]
-        self.clipped = [list(part.parameters()) for part in parts] if parts else [self.parameters]
-        self.clip, self.kept = clip, average
-        self.average = None if average is None else copy.deepcopy(learner)
-        self.adam = torch.optim.Adam(self.parameters, betas=betas, fused=fused or None)
-        self.steps = 0
+        self.parameters: list[torch.nn.Parameter] = [p for p in learner.parameters() if p.requires_grad]
+        self.clipped: list[list[torch.nn.Parameter]] = (
+            [list(part.parameters()) for part in parts] if parts else [self.parameters]
+        )
+        self.clip = clip
+        self.kept = average
+        self.average: torch.nn.Module | None = None if average is None else copy.deepcopy(learner)
+        self.adam: torch.optim.Adam = torch.optim.Adam(self.parameters, betas=betas, fused=fused or None)
+        self.steps: int = 0
 
     def step(self, loss: torch.Tensor, rate: float) -> float:
         """One step down a loss, at a learning rate; returns the loss."""

@@ -73,27 +73,30 @@ class MapPool:
     estimates."""
 
     def __init__(self, groups: Groups, grid: CellGrid, halves: np.ndarray) -> None:
-        self.groups, self.grid = groups, grid
+        self.groups = groups
+        self.grid = grid
         mass = np.maximum(backbone_mass(groups, grid), TINY)
         mean = halves.mean(axis=1)
-        self.y = torch.from_numpy((mean / mass[:, None, :, None]).astype(np.float32)).contiguous()
+        self.y: torch.Tensor = torch.from_numpy((mean / mass[:, None, :, None]).astype(np.float32)).contiguous()
         difference = (halves[:, 0] - halves[:, 1]).astype(np.float64)
         hit = (difference**2).sum(axis=(1, 2, 3)) / np.maximum(4 * mean.sum(axis=(1, 2, 3), dtype=np.float64), TINY)
-        self.hit = _float(hit[:, None] / mass)
+        self.hit: torch.Tensor = _float(hit[:, None] / mass)
         energy = mean.sum(axis=(1, 3), dtype=np.float64)
         energy = _smooth(energy) / np.maximum(energy.sum(axis=1, keepdims=True), TINY)
         share = ENERGY_SHARE * energy + (1 - ENERGY_SHARE) / grid.n_u
-        self.cdf = _float(np.cumsum(share / share.sum(axis=1, keepdims=True), axis=1))
+        self.cdf: torch.Tensor = _float(np.cumsum(share / share.sum(axis=1, keepdims=True), axis=1))
         slope = np.gradient(np.log(mass), axis=1)  # of the weight of a point within its cell, over the cell
-        self.slope = _float(np.where(np.abs(slope) < FLAT, FLAT, np.clip(slope, -STEEP, STEEP)))
+        self.slope: torch.Tensor = _float(np.where(np.abs(slope) < FLAT, FLAT, np.clip(slope, -STEEP, STEEP)))
         edges = radial_edges(groups, grid)
-        self.low, self.step = _float(edges[:, :1]), _float(edges[:, 1:2] - edges[:, :1])
-        self.mu_i, self.mu_o = _inside(groups.mu_i[:, None], groups), _inside(groups.mu_o, groups)
-        self.delta_phi = _float(groups.delta_phi)
+        self.low: torch.Tensor = _float(edges[:, :1])
+        self.step: torch.Tensor = _float(edges[:, 1:2] - edges[:, :1])
+        self.mu_i: torch.Tensor = _inside(groups.mu_i[:, None], groups)
+        self.mu_o: torch.Tensor = _inside(groups.mu_o, groups)
+        self.delta_phi: torch.Tensor = _float(groups.delta_phi)
         albedo, g, eta = (_float(v) for v in (groups.albedo, groups.g, groups.eta))
         L = length_scale(albedo, g)
-        self.L = L[:, None]
-        self.medium = torch.stack(medium_features(torch_library(), albedo, g, eta, L), -1)
+        self.L: torch.Tensor = L[:, None]
+        self.medium: torch.Tensor = torch.stack(medium_features(torch_library(), albedo, g, eta, L), -1)
 
     def batches(self, n_groups: int, n_queries: int) -> Callable[[torch.Generator], Batch]:
         """The source of a fit: `batch` of one size."""
@@ -202,13 +205,14 @@ class Small(nn.Module):
 
     def __init__(self, width: int = 32, depth: int = 3, seed: int = 0, start: Network | None = None) -> None:
         super().__init__()
-        self.width, self.depth = width, depth
-        self.shapes = layer_shapes(N_FEATURES, width, depth)
+        self.width = width
+        self.depth = depth
+        self.shapes: list[tuple[int, int]] = layer_shapes(N_FEATURES, width, depth)
         numbers = initial_numbers(self.shapes, torch.Generator().manual_seed(seed))
         if start is not None:
             pairs = zip(start.matrices, start.biases)
             numbers = torch.cat([torch.from_numpy(np.copy(v)).flatten() for pair in pairs for v in pair])
-        self.numbers = nn.Parameter(numbers)
+        self.numbers: nn.Parameter = nn.Parameter(numbers)
 
     def loss(self, batch: Batch) -> torch.Tensor:
         features = batch.features().flatten(0, 1)[None]
@@ -230,16 +234,19 @@ class Hyper(nn.Module):
     ) -> None:  # fmt: skip
         super().__init__()
         generator = torch.Generator().manual_seed(seed)
-        self.width, self.depth = width, depth
-        self.shapes = layer_shapes(N_FEATURES, width, depth)
+        self.width = width
+        self.depth = depth
+        self.shapes: list[tuple[int, int]] = layer_shapes(N_FEATURES, width, depth)
         sizes = [N_MEDIUM, medium_width, medium_width, rank]
-        self.matrices = nn.ParameterList(
+        self.matrices: nn.ParameterList = nn.ParameterList(
             torch.randn(i, j, generator=generator) / math.sqrt(i) for i, j in zip(sizes, sizes[1:])
         )
-        self.biases = nn.ParameterList(0.1 * torch.randn(j, generator=generator) for j in sizes[1:])
-        self.base = nn.Parameter(initial_numbers(self.shapes, generator))
+        self.biases: nn.ParameterList = nn.ParameterList(0.1 * torch.randn(j, generator=generator) for j in sizes[1:])
+        self.base: nn.Parameter = nn.Parameter(initial_numbers(self.shapes, generator))
         scale = torch.cat([torch.full((i * j + j,), 1 / math.sqrt(i)) for i, j in self.shapes])
-        self.basis = nn.Parameter(0.5 / math.sqrt(rank) * scale * torch.randn(rank, len(scale), generator=generator))
+        self.basis: nn.Parameter = nn.Parameter(
+            0.5 / math.sqrt(rank) * scale * torch.randn(rank, len(scale), generator=generator)
+        )
 
     def loss(self, batch: Batch) -> torch.Tensor:
         c = batch.medium
@@ -266,9 +273,12 @@ class PaperLearner(nn.Module):
 
     def __init__(self, medium: Medium, scale: float, width: int = 256, depth: int = 3, seed: int = 0) -> None:
         super().__init__()
-        self.medium, self.scale, self.width, self.depth = medium, scale, width, depth
-        self.shapes = layer_shapes(N_INPUTS, width, depth)
-        self.numbers = nn.Parameter(initial_numbers(self.shapes, torch.Generator().manual_seed(seed)))
+        self.medium = medium
+        self.scale = scale
+        self.width = width
+        self.depth = depth
+        self.shapes: list[tuple[int, int]] = layer_shapes(N_INPUTS, width, depth)
+        self.numbers: nn.Parameter = nn.Parameter(initial_numbers(self.shapes, torch.Generator().manual_seed(seed)))
 
     def inputs(self, batch: Batch) -> torch.Tensor:
         """The six inputs, each batch seen under a random azimuth of incidence, (B, S, 6)."""

@@ -99,8 +99,8 @@ def train_channel(
     recipe: MaterialRecipe = STANDARD,
     seed: int = 0,
     *,
-    folder: str | os.PathLike | None = None,
-    work: str | os.PathLike | None = None,
+    folder: str | os.PathLike[str] | None = None,
+    work: str | os.PathLike[str] | None = None,
     target_error: float | None = None,
     backend: str = "llvm",
     progress: NamedProgress | None = None,
@@ -188,7 +188,7 @@ class Trial(SymmetricModel):
 
     def __init__(self, medium: Medium, network: Network) -> None:
         super().__init__(medium)
-        self.networks = [network]
+        self.networks: list[Network] = [network]
         if network.matrices[0].shape[1] > WIDEST_IN_DRJIT:
             self.fast_in = "numpy"
 
@@ -237,7 +237,7 @@ class PaperTraining:
         return {"scale": learner.scale}
 
 
-TRAININGS = {"neural_material": MaterialTraining(), "neural_paper": PaperTraining()}
+TRAININGS: dict[str, ModelTraining] = {"neural_material": MaterialTraining(), "neural_paper": PaperTraining()}
 
 
 def train(
@@ -246,8 +246,8 @@ def train(
     model: str = "neural_material",
     recipe: MaterialRecipe = STANDARD,
     seed: int = 0,
-    folder: str | os.PathLike | None = None,
-    work: str | os.PathLike | None = None,
+    folder: str | os.PathLike[str] | None = None,
+    work: str | os.PathLike[str] | None = None,
     target_error: float | None = None,
     backend: str = "llvm",
     progress: NamedProgress | None = None,

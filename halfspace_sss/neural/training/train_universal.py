@@ -218,7 +218,7 @@ class UniversalRecipe:
 
 
 def train_universal(
-    folder: str | os.PathLike,
+    folder: str | os.PathLike[str],
     seed: int = 0,
     recipe: UniversalRecipe | None = None,
     *,
