@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numbers
 from collections.abc import Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -60,11 +61,9 @@ class Settings:
     def __post_init__(self) -> None:
         check_interval("mm_per_unit", self.mm_per_unit, *MM_PER_UNIT)
         check_interval("tolerance", self.tolerance, 1e-4, 10.0)
-        if self.max_depth < -1 or self.max_depth == 0:
-            raise ValueError(f"max_depth must be -1 or at least 1, got {self.max_depth}")
+        check_depth("max_depth", self.max_depth)
         check_count("rr_depth", self.rr_depth, 1)
-        if self.entries < 1 and self.entries != AUTOMATIC:
-            raise ValueError(f"entries must be at least 1, got {self.entries}")
+        check_depth("entries", self.entries)
         check_choice("light", self.light, LIGHTS)
         check_choice("orders", self.orders, ("", *ORDERS))
         check_choice("geometry", self.geometry, GEOMETRIES)
@@ -80,6 +79,12 @@ class Settings:
         given = {name: getattr(self, name) for name in OF_MODELS}
         given = {name: value for name, value in given.items() if value != AUTOMATIC}
         return given | ({"orders": self.orders} if self.orders else {})
+
+
+def check_depth(name: str, value: object) -> None:
+    """ValueError unless a value is a count, or -1 for none."""
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < -1 or value == 0:
+        raise ValueError(f"{name} must be -1 or a whole number >= 1, got {value!r}")
 
 
 def read_settings(props: mi.Properties) -> Settings:

@@ -55,6 +55,11 @@ def check_interval(name: str, value: object, low: float, high: float) -> None:
         raise ValueError(f"{name} must be a number in [{low:g}, {high:g}], got {_plain(value)!r}")
 
 
+def check_flag(name: str, value: object) -> None:
+    if not isinstance(value, bool):
+        raise ValueError(f"{name} must be true or false, got {value!r}")
+
+
 def check_finite(name: str, value: object) -> None:
     if isinstance(value, bool) or not isinstance(value, numbers.Real) or not math.isfinite(value):
         raise ValueError(f"{name} must be a finite number, got {_plain(value)!r}")

@@ -34,7 +34,7 @@ BAD_SCENES = {  # what is wrong -> what stands there instead of what, and the me
     "sky": ('type="constant"/>', 'type="envmap"><string name="filename" value="no.exr"/></emitter>', "no.exr"),
     "unit": (INTEGRATOR, INTEGRATOR.replace("integer", "float").replace("max_depth", "mm_per_unit")
              .replace("3", "0"), "mm_per_unit must be a number in [1e-09, 1e+09], got 0.0"),
-    "depth": ('name="max_depth" value="3"', 'name="max_depth" value="0"', "max_depth must be -1 or at least 1, got 0"),
+    "depth": ('name="max_depth" value="3"', 'name="max_depth" value="0"', "max_depth must be -1 or a whole number >="),
     "film": ('name="width" value="16"', 'name="width" value="0"', "a film must have 1 to 67108864 pixels, got 0 x 16"),
     "sensor": (SENSOR, "", "the scene must have a sensor, got none"),
     "boundary": ('<string name="material"', TWO_SURFACES + '<string name="material"', "at most one BSDF inside, got 2"),

@@ -38,7 +38,7 @@ from full_geometry.precomputed.unscattered_light import (
     obstacle,
     unscattered_light,
 )
-from full_geometry.settings import MM_PER_UNIT, OF_MITSUBA, WALK_LIGHTS, check_parameters
+from full_geometry.settings import MM_PER_UNIT, OF_MITSUBA, WALK_LIGHTS, check_depth, check_parameters
 from full_geometry.surface.textured import shown
 from full_geometry.surface.varying import equivalent
 from full_geometry.surface.wrapped import surface_of
@@ -49,7 +49,7 @@ from full_geometry.walk.scores import PathScores, with_derivatives
 from full_geometry.walk.straight_light import find_straight_light
 from halfspace_sss.arrays import aligned
 from halfspace_sss.backend import clock
-from halfspace_sss.checks import check_choice, check_interval
+from halfspace_sss.checks import check_choice, check_flag, check_interval
 from halfspace_sss.interrupts import checkpoint, interruptible
 
 PARAMETERS = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters", "connection_share", "blur", "light", "layers")
@@ -60,7 +60,7 @@ LAYER = ["emission.R", "emission.G", "emission.B"]
 SAMPLES_PER_RAY = 4  # of the image, for each ray of light: these take a tenth of the time or less
 SAMPLES_PER_PATH = 8  # the same for each path of scattered light, which takes as long as a few samples
 FEWEST_RAYS, MOST_RAYS = 2**16, 2**21
-FOREVER = 2**31 - 1
+FOREVER, DEPTHS = 2**31 - 1, {"max_depth": -1, "rr_depth": 5}
 WIDEST = 20.0  # blur: 1 and 3 radians
 Keep = Callable[[FirstExits], None]
 
@@ -93,16 +93,15 @@ def _class(variant: str) -> type:
         def __init__(self, props: mi.Properties) -> None:
             check_parameters("translucent_walk", props, (*PARAMETERS, *OF_MITSUBA))
             mi.SamplingIntegrator.__init__(self, props)
-            self.mm_per_unit = float(props.get("mm_per_unit", 1.0))
+            self.mm_per_unit, self.hidden = props.get("mm_per_unit", 1.0), props.get("hide_emitters", False)
+            self.max_depth, self.rr_depth = (_depth(name, props.get(name, n)) for name, n in DEPTHS.items())
+            self.connection_share, self.blur = props.get("connection_share", 0.5), props.get("blur", 1.0)
+            self.light, self.layers = props.get("light", "auto"), props.get("layers", False)
             check_interval("mm_per_unit", self.mm_per_unit, *MM_PER_UNIT)
-            self.max_depth = _depth("max_depth", int(props.get("max_depth", -1)))
-            self.rr_depth = _depth("rr_depth", int(props.get("rr_depth", 5)))
-            self.hidden = bool(props.get("hide_emitters", False))
-            self.connection_share = _share("connection_share", float(props.get("connection_share", 0.5)))
-            self.blur = _scale("blur", float(props.get("blur", 1.0)))
-            self.light = str(props.get("light", "auto"))
+            check_interval("connection_share", self.connection_share, 0.0, 1.0)
+            check_interval("blur", self.blur, 0.0, WIDEST)
             check_choice("light", self.light, WALK_LIGHTS)
-            self.layers = bool(props.get("layers", False))
+            check_flag("layers", self.layers)
             self._prepared: tuple[SceneMark | None, list, list, Any] = (None, [], [], None)
             self._checked: tuple[Any, str] = (None, "")
             self._cells: tuple[Any, list] = (None, [])
@@ -442,20 +441,7 @@ def _other_light(tracer: PathTracer, sensor: mi.Sensor, seed: int) -> float:
     return float((light**2).sum() / max(light.shape[1], 1))
 
 
-def _scale(name: str, value: float) -> float:
-    if not 0 <= value <= WIDEST:
-        raise ValueError(f"{name} must be in [0, {WIDEST:g}], got {value!r}")
-    return value
-
-
-def _share(name: str, value: float) -> float:
-    if not 0 <= value <= 1:
-        raise ValueError(f"{name} must be in [0, 1], got {value!r}")
-    return value
-
-
 def _depth(name: str, value: int) -> int:
     """A number of vertices; -1 stands for no limit."""
-    if value < -1 or value == 0:
-        raise ValueError(f"{name} must be -1 (no limit) or at least 1, got {value}")
+    check_depth(name, value)
     return FOREVER if value == -1 else value

@@ -68,7 +68,7 @@ from full_geometry.surface.spectral import EVERYWHERE, MediumByWavelength, read_
 from full_geometry.surface.textured import TexturedMedium, constant_texture, textured_medium
 from full_geometry.surface.varying import VaryingMedium, constant_value, mean_of_grids, varying_medium
 from halfspace_sss import materials
-from halfspace_sss.checks import check_choice
+from halfspace_sss.checks import check_choice, check_flag
 from halfspace_sss.materials.catalogue import one_channel
 from halfspace_sss.materials.spectra import SpectralMedium
 from halfspace_sss.physics.fresnel import F_t, mu_internal
@@ -547,8 +547,7 @@ def read_medium_spec(props: mi.Properties) -> MediumSpec:
     priority, reflection = number_of(props, "priority"), props.get("reflection", True)
     if not math.isfinite(priority or 0.0):
         raise ValueError(f"priority must be finite, got {priority!r}")
-    if not isinstance(reflection, bool):
-        raise ValueError(f"reflection must be true or false, got {reflection!r}")
+    check_flag("reflection", reflection)
     return MediumSpec(
         label=label, medium=medium, model=model, orders=orders, reflection=reflection,
         varying=varying, textured=textured, spectral=spectral, priority=priority,

@@ -77,5 +77,5 @@ def test_several_entries_are_less_noisy_under_a_sky():
 
 @pytest.mark.parametrize("entries", [0, -3])
 def test_fewer_than_one_entry_is_refused(entries):
-    with pytest.raises(Exception, match="entries must be at least 1"):
+    with pytest.raises(Exception, match="entries must be -1 or a whole number >= 1"):
         mi.load_dict({"type": "bssrdf", "entries": entries})

@@ -36,6 +36,10 @@ PLUGINS = [
     ({"type": "translucent_walk", "entries": 3}, "parameter of translucent_walk must be .*got 'entries'"),
     ({"type": "translucent_walk", "connection_share": 2.0}, "connection_share must be .*got 2.0"),
     ({"type": "translucent_walk", "blur": -1.0}, "blur must be .*got -1.0"),
+    ({"type": "translucent_walk", "max_depth": 2.7}, "max_depth must be -1 or a whole number >= 1, got 2.7"),
+    ({"type": "translucent_walk", "layers": "false"}, "layers must be true or false, got 'false'"),
+    ({"type": "bssrdf", "max_depth": float("nan")}, "max_depth must be -1 or a whole number >= 1, got nan"),
+    ({"type": "bssrdf", "entries": 2.5}, "entries must be -1 or a whole number >= 1, got 2.5"),
 ]
 
 
