@@ -298,6 +298,29 @@ def broadcast_query(*args: Real, names: Sequence[str] = ()) -> tuple[Library, tu
         raise ValueError(f"query shapes do not broadcast: {error}") from error
 
 
+def labelled(function: Callable[..., Real], args: Sequence[Real], name: str, channels: bool) -> Real:
+    """function(*args) with the labels of its arguments: series of pandas with one index give a series, or a table with
+    a column for each channel; arrays of xarray are broadcast by their dimensions and give an array, channels last.
+    ValueError if series have several indices, or values are masked, whose mask would be lost."""
+    kinds = {f"{type(a).__module__.partition('.')[0]}.{type(a).__name__}" for a in args}
+    if "numpy.MaskedArray" in kinds:
+        raise ValueError("arguments of a query must be plain arrays, got a masked one: fill or drop masked values")
+    if "xarray.DataArray" in kinds:
+        import xarray
+
+        found = xarray.apply_ufunc(function, *args, output_core_dims=[["channel"] if channels else []])
+        return found.rename(name)
+    if "pandas.Series" in kinds:
+        import pandas
+
+        indices = [a.index for a in args if isinstance(a, pandas.Series)]
+        if not all(index.equals(indices[0]) for index in indices):
+            raise ValueError("series of a query must have one index, got several")
+        values = function(*(a.to_numpy() if isinstance(a, pandas.Series) else a for a in args))
+        return pandas.DataFrame(values, indices[0]) if channels else pandas.Series(values, indices[0], name=name)
+    return function(*args)
+
+
 def aligned(kind: type, values: np.ndarray) -> Lanes:
     """Numbers of any shape as one array of Dr.Jit, 32 bits each, at an address that is a multiple of 64.
     Dr.Jit takes over the memory of NumPy, and whether its address is one is in the code of kernels: where chance

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
-from halfspace_sss.arrays import Library, Real, asks_nothing, broadcast_query, is_torch
+from halfspace_sss.arrays import Library, Real, asks_nothing, broadcast_query, is_torch, labelled
 from halfspace_sss.checks import check_query
 from halfspace_sss.interface.query import Query
 from halfspace_sss.lazy import once
@@ -96,6 +96,7 @@ class BSSRDF(abc.ABC):
             phi_i, phi_o: azimuths of w_i and w_o about the normal from the direction x_i -> x_o, radians.
                 Arguments broadcast as in NumPy; a medium with channels adds its channel axis last.
 
+        Series of pandas and arrays of xarray give the same again, with their labels; the latter broadcast by dimension.
         Derivatives by torch are recorded in blocks, so that their memory is bounded; the numbers are the same.
         Derivatives with respect to a medium of tensors are recorded at once.
 
@@ -103,11 +104,13 @@ class BSSRDF(abc.ABC):
             ValueError: an argument is out of range or not a number (NumPy and torch; Dr.Jit lanes cannot be
                 inspected while a kernel is recorded), or libraries are mixed.
         """
-        return self._S(self.G, r, mu_i, phi_i, mu_o, phi_o)
+        query, channels = (r, mu_i, phi_i, mu_o, phi_o), self.medium.n_channels is not None
+        return labelled(functools.partial(self._S, self.G), query, "S", channels)
 
     def eval_unclamped(self, r: Real, mu_i: Real, phi_i: Real, mu_o: Real, phi_o: Real) -> Real:
         """`eval` without the clamp that keeps a model from turning negative; the same where it has none."""
-        return self._S(self.G_unclamped, r, mu_i, phi_i, mu_o, phi_o)
+        query, channels = (r, mu_i, phi_i, mu_o, phi_o), self.medium.n_channels is not None
+        return labelled(functools.partial(self._S, self.G_unclamped), query, "S", channels)
 
     def _S(self, G_of: Callable[[Query], Real], *query: Real) -> Real:
         """sigma_t² T_12 T_21 G_of(query)."""
