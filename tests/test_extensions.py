@@ -18,7 +18,7 @@ from halfspace_sss import Medium, extensions, registry
 
 OWN = [cls.name for cls in (*MODELS, *halfspace_sss.neural.MODELS)]
 START = [sys.executable, "-c", "from figures.command_line import main; main()"]
-QUICK = ["curves", "--theta-i", "0", "--paths", "256", "--model", "standard_dipole", "--out", "out"]
+QUICK = ["curves", "--theta-i", "0", "--paths", "0", "--model", "standard_dipole", "--out", "out"]
 
 
 class Entry:

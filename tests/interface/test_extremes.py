@@ -17,7 +17,7 @@ ETA = (0.66, 1.0, 1.0001, 1.5, 3.0)
 SIGMA_T = (1e-4, 1.0, 1e4)
 N_RANDOM = 120
 SMALLEST = 1e-36  # 1/mm² and 1/mfp²: above, float32 has all its digits
-EVERY = {"neural_paper": 7}  # medium, as each has a large file; all values of all parameters are among them
+EVERY = {"neural_paper": 13}  # medium, as each has a large file; all values of all parameters are among them
 
 
 def media() -> list[Medium]:

@@ -74,7 +74,7 @@ def test_a_kernel_serves_other_crops_of_a_film(model):
 @pytest.mark.parametrize(("model", "light"), [("better_dipole", "gathered"), ("path_traced", "precomputed")])
 def test_a_scene_again_compiles_nothing_wherever_numpy_has_put_its_numbers(model, light):
     hashes, kept = [], []
-    for k in range(4):
+    for k in range(3):
         kept.append([np.empty(100 + 37 * k + j, np.uint8) for j in range(8)])  # so that other memory is free
         gc.collect()
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
@@ -84,7 +84,7 @@ def test_a_scene_again_compiles_nothing_wherever_numpy_has_put_its_numbers(model
             hashes.append({kernel["hash"] for kernel in dr.kernel_history([dr.KernelType.JIT])})
         del scene
     # the second image may still find the registry of the first
-    assert len(hashes[0]) > 10 and not (hashes[2] | hashes[3]) - (hashes[0] | hashes[1])
+    assert len(hashes[0]) > 10 and not hashes[2] - (hashes[0] | hashes[1])
 
 
 def _of_size(rng: np.random.Generator, light: str = "sampled") -> dict[str, int]:
