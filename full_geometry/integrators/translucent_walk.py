@@ -144,7 +144,7 @@ def _class(variant: str) -> type:
             # ---- light inside, precomputed by as many rays as the image has samples for
             if samples and self.precomputes(scene, media):
                 if self._cells[0] is not media:
-                    self._cells = media, inside_cells_of(media)
+                    self._cells = media, inside_cells_of(media, *self._cells)
                 if light is None:
                     started, rays = clock(), min(max(samples // SAMPLES_PER_RAY, FEWEST_RAYS), MOST_RAYS)
                     ends = holds_scattered(media) and inner is None and self.max_depth == FOREVER and not exits
@@ -293,7 +293,7 @@ def _prepared(scene: mi.Scene, before: tuple, mm_per_unit: float) -> tuple[Scene
         return before
 
     # ---- media anew, and warnings of cameras inside objects and of doubtful units
-    media = WalkMedia.of(scene, mm_per_unit)
+    media = (before[3].renewed() if before[3] is not None and same else None) or WalkMedia.of(scene, mm_per_unit)
     check_sensors(scene, media.objects)
     for each, inside in zip(media.objects, media.specs):
         known = equivalent(inside, each) if inside.textured else inside

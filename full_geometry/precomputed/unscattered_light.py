@@ -28,7 +28,7 @@ that: phase functions are cut after q_2 = g² instead, and MOST_TRUNCATED bounds
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import zip_longest
@@ -252,11 +252,16 @@ def holds_scattered(media: WalkMedia) -> bool:
     return not (media.varies or media.carried) and not any(np.any(spec.medium.g) for spec in media.specs)
 
 
-def inside_cells_of(media: WalkMedia) -> list[InsideCells]:
-    """The cells of all objects."""
-    results = []
+def inside_cells_of(
+    media: WalkMedia, before: WalkMedia | None = None, cells: Sequence[InsideCells] = ()
+) -> list[InsideCells]:
+    """The cells of all objects: those of `before` if it is of the same scene and they are as large."""
+    results, same = [], before is not None and before.scene is media.scene
     for k in range(len(media.instance_table.kind)):
         box, h, depths = _grid(media, k)
+        if same and _grid(before, k)[1:] == (h, depths):
+            results.append(cells[k])
+            continue
         area, volume = _extent(media, k)
         points = partial(_surface_points, media, k, area)
         results.append(InsideCells.of(media, k, points, box, h, depths, 4 * volume / area))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -421,6 +421,16 @@ class WalkMedia:
         """Whether the objects still have the shapes and the media that this was made of."""
         pairs = zip(self.objects, self.specs)
         return all(inside is surface_of(obj.shape).spec and obj.is_current() for obj, inside in pairs)
+
+    def renewed(self) -> WalkMedia | None:
+        """The same shapes with the media that they have now; None if they moved, or hold or are around something."""
+        if self.inner is not None or self.wrappings or self.shown or not all(obj.is_current() for obj in self.objects):
+            return None
+        surfaces = [surface_of(obj.shape) for obj in self.objects]
+        for surface, obj in zip(surfaces, self.objects):
+            if surface.spec.textured is not None:
+                surface.spec.textured.check(obj)
+        return replace(self, specs=[each.spec for each in surfaces], boundaries=[each.boundary for each in surfaces])
 
     @property
     def same_g(self) -> bool:
