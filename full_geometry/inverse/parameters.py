@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.geometry import mesh
 from full_geometry.geometry.shape import name_of
 from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.objects.objects import KnowsUnit, translucent_shapes
@@ -75,10 +76,12 @@ def check_derivatives(integrator: mi.Integrator, shape: mi.Shape, names: Sequenc
 
 
 def check_names(names: Sequence[str], known: Sequence[str]) -> None:
-    """ValueError if names of parameters are none of those known, are there twice, or ask for sigma_t and mfp both."""
+    """ValueError if names are none of those known, of a shape, there twice, or ask for sigma_t and mfp both."""
     if not names or len(set(names)) < len(names):
         raise ValueError(f"parameters must be one or more of {', '.join(known)}, each once, got {list(names)}")
     for name in names:
+        if name.rsplit(".", 1)[-1] in (*mesh.GEOMETRY, "to_world"):
+            raise ValueError(f"parameter must not be of a shape, whose silhouettes have no derivatives, got {name!r}")
         check_choice("parameter", name, known)
     if {"sigma_t", "mfp"} <= set(names):
         raise ValueError("parameters must be sigma_t or mfp, got both")

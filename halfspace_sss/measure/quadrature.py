@@ -10,7 +10,7 @@ import numpy as np
 
 from halfspace_sss.checks import check_count
 from halfspace_sss.physics.fresnel import mu_external
-from halfspace_sss.physics.medium import Medium
+from halfspace_sss.physics.medium import Medium, check_numbers
 
 SCAN = (-9, 9)  # decades about the mean free path in which the flux is looked for
 DEAD = 1e-9  # share of its largest value below which the integrand in ln r is left to a geometric series
@@ -48,6 +48,7 @@ class Angles:
     """
 
     def __init__(self, evaluate: Evaluate, medium: Medium, q: Quadrature, probe: Evaluate | None = None) -> None:
+        check_numbers("medium", medium)
         self.mu_o: np.ndarray
         self.w_mu: np.ndarray
         self.evaluate = evaluate

@@ -23,7 +23,7 @@ from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.measure.quadrature import Angles, Quadrature, cosine_nodes, distances, log_sum
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.fresnel import C_1, F_t, mu_external, mu_internal
-from halfspace_sss.physics.medium import Medium, check_scalar_medium
+from halfspace_sss.physics.medium import Medium, check_numbers, check_scalar_medium
 from halfspace_sss.registry import bssrdf, models
 from halfspace_sss.tracing.instrument import Readings, checked_frequencies, transformed
 
@@ -95,7 +95,7 @@ def reflectance(
         Array of the shape of mu_i, with the channel axis last if the medium has channels; a number for numbers.
 
     Raises:
-        ValueError: mu_i is out of range, or the model cannot form the order.
+        ValueError: mu_i is out of range, the model cannot form the order, or the medium has derivatives.
     """
     check_order(model, order)
     angles = Angles(model.eval, model.medium, quadrature or DEFAULT)
@@ -321,11 +321,11 @@ def reciprocity_gap(model: BSSRDF, n: int = 4096, seed: int = 0) -> ReciprocityG
     is sum r² |S - S'| / sum r² |S + S'|, the share of the transported flux. One value per channel where there are any.
 
     Raises:
-        ValueError: n < 1.
+        ValueError: n < 1, or the medium has derivatives.
     """
     if n < 1:
         raise ValueError(f"n must be >= 1, got {n!r}")
-    m = model.medium
+    check_numbers("medium", m := model.medium)
     mfp, transport = np.atleast_1d(m.mfp), 1 / np.maximum(np.atleast_1d(m.sigma_t_prime), 1e-300)
     gaps = []
     for k in range(len(mfp)):

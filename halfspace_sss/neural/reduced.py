@@ -39,6 +39,7 @@ from halfspace_sss.neural.network import (
 )
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.physics.backbone import backbone_shape, length_scale
+from halfspace_sss.physics.medium import check_numbers
 
 PLACES = 0.1, 0.9  # of the two networks among the models
 MODES = 4  # functions beside the first
@@ -59,7 +60,13 @@ class ReducedNetworks:
 
     @classmethod
     def of(cls, models: Sequence[SymmetricModel]) -> ReducedNetworks:
-        """Reduce models of one g and eta, in an order of albedos in which they are smooth."""
+        """Reduce models of one g and eta, in an order of albedos in which they are smooth.
+
+        Raises:
+            ValueError: a medium has derivatives, which would be lost.
+        """
+        for m in models:
+            check_numbers("medium", m.medium)
         q = _queries(max(_length(m) for m in models), models[0].medium.eta)
         wanted = np.stack([_log_factor(m, q) for m in models])
         weights = _weights(models, q, wanted)

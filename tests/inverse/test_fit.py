@@ -76,6 +76,7 @@ def test_views_and_parameters_that_do_not_fit_are_refused_by_name(tmp_path: Path
     refused("image a must be 8 x 8 of 3 channels as sensor 0, got 4 x 8", [GivenView.of("a", 0, image[:, :4])])
     refused("sensor of a must be below 1", [GivenView.of("a", 1, image)])
     refused("parameter must be one of albedo.*got 'albdo'; did you mean 'albedo'", names=("albdo",))
+    refused("parameter must not be of a shape.*got 'ball.vertex_positions'", names=("ball.vertex_positions",))
     refused("alpha of 'ball' must be a number of a roughdielectric to be fitted, got a smooth", names=("alpha",))
     refused("edits of b must be of the keys none as of a", [good, GivenView.of("b", 0, image, edits={"x": [1]})])
     refused("lamp in edits of a must be the key of numbers", [GivenView.of("a", 0, image, edits={"lamp": [1]})])

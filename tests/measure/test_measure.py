@@ -245,6 +245,13 @@ def test_bad_arguments_are_refused_with_modelbound_and_value(call, message):
         call(bssrdf("standard_dipole", Medium(1.0, 0.1)))
 
 
+@pytest.mark.parametrize("call", [measure.reflectance, measure.moments, measure.reciprocity_gap])
+def test_media_with_derivatives_are_refused_by_name(call):
+    sigma_s = pytest.importorskip("torch").tensor(1.0, requires_grad=True)
+    with pytest.raises(ValueError, match=r"medium must be of numbers \(take medium.detached\(\)\)"):
+        call(bssrdf("standard_dipole", Medium(sigma_s, 0.1)))
+
+
 def test_positions_of_a_denser_medium_raise_the_variance_of_the_weight(name):
     try:
         model, other = (bssrdf(name, Medium.from_albedo(0.9, sigma_t, 0.3, 1.3)) for sigma_t in (1.0, 8.0))

@@ -48,3 +48,9 @@ def test_reduced_networks_have_the_S_of_each_albedo() -> None:
 def test_reduced_networks_are_the_same_each_time() -> None:
     one, two = (ReducedNetworks.of(_models()) for _ in range(2))
     assert np.array_equal(one.coefficients, two.coefficients)
+
+
+def test_media_with_derivatives_are_refused_by_name() -> None:
+    g = pytest.importorskip("torch").tensor(G, requires_grad=True)
+    with pytest.raises(ValueError, match="medium must be of numbers"):
+        ReducedNetworks.of([Neural(Medium.from_albedo(0.6, 1.0, g, ETA))])
