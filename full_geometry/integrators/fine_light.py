@@ -56,12 +56,8 @@ class _Light(NamedTuple):
 @dataclass(frozen=True)
 class FineLight:
     """What emitters with fine detail bring to the points of an object.
-
-    Args:
-        emitters: which; what is gathered at the points leaves them out.
-        incident: radiance of them all.
-        area: of the surface nearest to each point.
-    """
+    `emitters`: which; what is gathered at the points leaves them out. `incident`: radiance of them all. `area`: of the
+    surface nearest to each point."""
 
     emitters: list[mi.Emitter]
     incident: Incident

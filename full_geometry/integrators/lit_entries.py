@@ -54,11 +54,7 @@ class LitEntries:
         self, scene: mi.Scene, objects: list[TranslucentObject], settings: Settings, samples: int
     ) -> list[Proposals | None]:
         """The proposals of each object.
-
-        Args:
-            scene, objects, settings: what is rendered.
-            samples: of all pixels.
-        """
+        `scene`, `objects`, `settings`: what is rendered. `samples`: of all pixels."""
         count = int(min(SHARE * samples, MOST))
         if count < LEAST or mi.is_spectral:
             return [obj.proposals for obj in objects]
@@ -105,9 +101,7 @@ def _cells(geometry: Geometry, faces: int) -> np.ndarray:
 
 def _brought(context: RenderContext, obj: TranslucentObject, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Faces of uniform points, and the square of what a direction at them brings for a unit of S, mean of channels.
-
-    Half of the mean square over emitter samples and directions by the cosine: a factor of all is of no account.
-    """
+    Half of the mean square over emitter samples and directions by the cosine: a factor of all is of no account."""
     # uniform points of the surface
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(SEED, count)

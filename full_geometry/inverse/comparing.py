@@ -265,12 +265,8 @@ class ViewMisfit(NamedTuple):
 @dataclass(frozen=True, eq=False)
 class ViewComparison:
     """The views of a scene as it is now, against their images.
-
-    Args:
-        scene, views, settings: as of `fit`, checked.
-        factors: of each view, changed in place: of its render to its image, up to one common factor.
-        shown: of views that were met, changed in place: B, without exposure.
-    """
+    `scene`, `views`, `settings`: as of `fit`, checked. `factors`: of each view, changed in place: of its render to its
+    image, up to one common factor. `shown`: of views that were met, changed in place: B, without exposure."""
 
     scene: mi.Scene
     views: list[GivenView]
@@ -305,11 +301,8 @@ class ViewComparison:
 
     def view(self, which: int, k: int, pair: Sequence[np.ndarray] = ()) -> ViewMisfit:
         """Compare a view with its image in step k; a view that is held out takes the exposure that suits it best.
-
-        Args:
-            k: number of the step, which seeds the renders.
-            pair: two renders of the view, if there are any; by default they are made.
-        """
+        `k`: number of the step, which seeds the renders. `pair`: two renders of the view, if there are any; by default
+        they are made."""
         view = self.views[which]
         purposes = ("test", "other test") if view.held_out else ("first", "second")
         pair = pair or [self.image(view, self.seed(k, which, each)) for each in purposes]
@@ -387,14 +380,9 @@ class ViewComparison:
 
     def sloping(self, measured: np.ndarray | float, names: Iterable[str]) -> tuple[bool, bool]:
         """Whether the first and the second render of a view are to have derivatives.
-
         Differences take further renders, and those by pixels are kept; of models there is little left for products of
-        different renders once there are derivatives.
-
-        Args:
-            measured: how many derivatives the means of the view, or of its pixels, count for.
-            names: of variables.
-        """
+        different renders once there are derivatives. `measured`: how many derivatives the means of the view, or of its
+        pixels, count for. `names`: of variables."""
         if self.by_differences or set(names) & set(STEPPED):
             return bool(np.ndim(measured) == 0 or np.median(measured) < SLOPES), False
         return True, bool(self.at_once or np.max(measured) < 1)
@@ -538,10 +526,7 @@ def means_of_arrays(arrays: Mapping[str, np.ndarray], kind: Callable[..., Any]) 
 
 def descend(descent: FitDescent, work: Path | None, progress: ProgressText | None) -> None:
     """Take all steps that are left, kept in the folder `work`, from which the same fit goes on.
-
-    Raises:
-        ValueError: `work` is that of another fit.
-    """
+    ValueError if `work` is that of another fit."""
     path, of = work and work / "state.npz", descent.fingerprint()
     if path is not None and path.exists():
         _load(path, of, descent)

@@ -177,10 +177,7 @@ class ViewMeans:
 
 class MediumDescent:
     """Gauss-Newton steps on the variables of a medium.
-
-    Args:
-        comparison: of the scene with images.
-    """
+    `comparison`: of the scene with images."""
 
     def __init__(self, comparison: ViewComparison, parameters: FitParameters) -> None:
         self.comparison, self.parameters = comparison, parameters
@@ -301,11 +298,8 @@ class MediumDescent:
 
     def _covariance(self, alike: float, common: bool = False) -> np.ndarray:
         """The covariance of the variables by residuals r of all pixels, H^-1 (sum w² r² J^T J) H^-1.
-
-        Args:
-            alike: factor by which the variance of means is larger, where noise of neighbouring pixels is alike.
-            common: whether the exposure of all views is a variable too, the last one.
-        """
+        `alike`: factor by which the variance of means is larger, where noise of neighbouring pixels is alike. `common`:
+        whether the exposure of all views is a variable too, the last one."""
         pixels, H, squares = 0, 0.0, 0.0
         for which, means in self.means.items():
             e, left = self.comparison.exposures[which], self._residual(which)[0]

@@ -193,11 +193,7 @@ class Variable:
 
     def places(self, shape: mi.Shape, si: mi.SurfaceInteraction3f, corner: mi.Point2f) -> tuple[np.ndarray, np.ndarray]:
         """Numbers of texels at points of the surface, and their weights there, both of shape (k, points).
-
-        Args:
-            si: the points.
-            corner: their barycentric coordinates in their face.
-        """
+        `si`: the points. `corner`: their barycentric coordinates in their face."""
         n = dr.width(si)
         if self.texture is None:
             return np.zeros((1, n), int), np.ones((1, n))
@@ -242,10 +238,7 @@ class Variable:
 @dataclass(frozen=True, eq=False)
 class TextureParameters:
     """The textures and constants of one object that are fitted.
-
-    Args:
-        variables: textures and constants.
-    """
+    `variables`: textures and constants."""
 
     shape: mi.Shape
     variables: list[Variable]
@@ -253,11 +246,8 @@ class TextureParameters:
     @classmethod
     def of(cls, names: Sequence[str], shape: mi.Shape, mm_per_unit: float, scene: mi.Scene) -> TextureParameters:
         """Choose the parameters of an object by name.
-
-        Raises:
-            ValueError: a name is unknown, there twice, or of another medium than the object's; a texture is neither a
-                bitmap nor an attribute of the mesh.
-        """
+        ValueError if a name is unknown, there twice, or of another medium than the object's; a texture is neither a
+        bitmap nor an attribute of the mesh."""
         textured = surface_of(shape).spec.textured
         constants = [name for name in textured.constants if name != "sigma_t"]
         lengths = ["sigma_t", "mfp"] if "sigma_t" in textured.constants else []
@@ -345,14 +335,9 @@ def _neighbours(shape: mi.Shape, attribute: str) -> np.ndarray:
 @dataclass(eq=False)
 class PixelMeans:
     """Means of what was measured of a view in the steps, by pixel and channel.
-
-    Args:
-        weights, stiffness, image, variance: of renders without exposure times weights, and variance of that mean by
-            noise.
-        slopes: s of each variable, shape (variables, pixels).
-        shown: D of the numbers of each variable there, likewise.
-        renders, sloped: how many the means count for, and of them those of slopes.
-    """
+    `weights`, `stiffness`, `image`, `variance`: of renders without exposure times weights, and variance of that mean by
+    noise. `slopes`: s of each variable, shape (variables, pixels). `shown`: D of the numbers of each variable there,
+    likewise. `renders`, `sloped`: how many the means count for, and of them those of slopes."""
 
     weights: np.ndarray
     stiffness: np.ndarray
@@ -397,12 +382,7 @@ class PixelMeans:
 @dataclass(frozen=True, eq=False)
 class Curvature:
     """J^T w J + L.
-
-    Args:
-        J: of pixels of all views by variables.
-        weights: of these pixels.
-        L: of the total variation.
-    """
+    `J`: of pixels of all views by variables. `weights`: of these pixels. `L`: of the total variation."""
 
     J: csr_array
     weights: np.ndarray
@@ -423,10 +403,7 @@ class Curvature:
 
 class TextureDescent:
     """Gauss-Newton steps on textures and constants.
-
-    Args:
-        comparison: of the scene with images.
-    """
+    `comparison`: of the scene with images."""
 
     def __init__(self, comparison: ViewComparison, parameters: TextureParameters) -> None:
         self.comparison, self.parameters = comparison, parameters
@@ -655,12 +632,8 @@ class TextureDescent:
 
 def painted_mesh(scene: str | Path, name: str | None, values: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> bytes:
     """A PLY file of a mesh with attributes of a fit and their standard errors, in the space of the scene.
-
-    Args:
-        scene: XML file.
-        name: of the object, or None.
-        values: by parameter, as of `MaterialFit.textures` and `MaterialFit.texture_errors`.
-    """
+    `scene`: XML file. `name`: of the object, or None. `values`: by parameter, as of `MaterialFit.textures` and
+    `MaterialFit.texture_errors`."""
     shape = translucent_object(open_scene(scene, PATH_TRACED), name)
     parameters, stream = mi.traverse(shape), mi.MemoryStream()
     for key, (each, errors) in values.items():

@@ -165,10 +165,7 @@ def _camera(name: str, camera: dict[str, Any], size: tuple[int, int], part: tupl
 
 def numbers_of(name: str, value: object, count: int) -> list[float]:
     """So many finite numbers.
-
-    Raises:
-        ValueError: they are others.
-    """
+    ValueError if they are others."""
     try:
         found = np.array(value, dtype=float).ravel()
     except (TypeError, ValueError):
@@ -194,12 +191,9 @@ def _pixels(path: Path) -> np.ndarray:
 
 def check_views(scene: mi.Scene, views: Sequence[GivenView], shape: mi.Shape) -> None:
     """Refuse views that do not belong to a scene.
-
-    Raises:
-        ValueError: a sensor does not exist, or its film is of another size or number of channels than the image; all
-            views are held out; the object is seen by none that is not; or views edit different keys, or one that is no
-            number of the scene.
-    """
+    ValueError if a sensor does not exist, or its film is of another size or number of channels than the image; all
+    views are held out; the object is seen by none that is not; or views edit different keys, or one that is no number
+    of the scene."""
     seen, channels = 0, len(mi.Spectrum(0))
     for view in views:
         if isinstance(view.sensor, int) and view.sensor >= len(scene.sensors()):

@@ -273,8 +273,11 @@ def errors(
 
 def transport_of(obj: TranslucentObject, model: str, folder: str | os.PathLike[str] | None = None) -> Transport:
     """The transport called `model` of an object: "full_geometry", one that a package adds, or a half-space model.
-    ValueError if the object has not been trained, there is no such model, it refuses the object as renders would, or it
-    has no S for two points of a surface."""
+
+    Raises:
+        ValueError: the object has not been trained, there is no such model, it refuses the object as renders would, or
+            it has no S for two points of a surface.
+    """
     inclusions, entry = obj.geometry.inclusions, lookup(model)
     if inclusions is not None and not entry.capabilities.inclusions:
         refuse(inclusions.found[0], obj.geometry, f"the model {model!r}")

@@ -32,13 +32,8 @@ CLOSEST = 0.3  # distances of places: f is no larger
 @dataclass(frozen=True, eq=False)
 class StratifiedEntries:
     """Places for exits at points, as many for each.
-
-    Args:
-        places: of the surface.
-        point: to which each belongs.
-        chosen: the place of each entry, exit by exit, in the order along the surface.
-        weight: the inverse of the density of each entry, (scene unit)².
-    """
+    `places`: of the surface. `point`: to which each belongs. `chosen`: the place of each entry, exit by exit, in the
+    order along the surface. `weight`: the inverse of the density of each entry, (scene unit)²."""
 
     places: EntrySample
     point: mi.UInt32

@@ -71,14 +71,9 @@ def split_extinction(medium: Medium) -> np.ndarray:
 @dataclass
 class ForwardRun:
     """The events of a walk since it entered an object, as far as they may all have been forward.
-
-    Args:
-        share: product of 1 - q over their turns, by channel: of the light that the walk meets next without an event,
-            this share has met forward events alone, and is not precomputed.
-        along: direction of arrival at the last event.
-        g: mean cosine there.
-        turned: whether the turn at that event is still to be counted.
-    """
+    `share`: product of 1 - q over their turns, by channel: of the light that the walk meets next without an event, this
+    share has met forward events alone, and is not precomputed. `along`: direction of arrival at the last event. `g`:
+    mean cosine there. `turned`: whether the turn at that event is still to be counted."""
 
     share: mi.Spectrum
     along: mi.Vector3f

@@ -178,13 +178,8 @@ def _weights(f: np.ndarray, cell: np.ndarray, counts: np.ndarray) -> csr_array:
 @dataclass(frozen=True, eq=False)
 class InnerLight:
     """J of an object in the light of a scene.
-
-    Args:
-        events: its grid.
-        planes: (nodes, bands, channels, 4), one after the other.
-        bands: largest l.
-        g: of each channel.
-    """
+    `events`: its grid. `planes`: (nodes, bands, channels, 4), one after the other. `bands`: largest l. `g`: of each
+    channel."""
 
     events: Events
     planes: mi.Float

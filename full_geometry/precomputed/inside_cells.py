@@ -43,11 +43,8 @@ PLACES = [np.arange(BRICK**3) // BRICK**a % BRICK for a in range(3)]  # of the c
 @dataclass(frozen=True, eq=False)
 class CellIndex:
     """Which cell holds a point.
-
-    Args:
-        brick: of each brick twice the place of its cells in `slot`, one more where they are coarse; -1 without cells.
-        slot: of each cell of these bricks its number among those that hold a part of the inside, or -1.
-    """
+    `brick`: of each brick twice the place of its cells in `slot`, one more where they are coarse; -1 without cells.
+    `slot`: of each cell of these bricks its number among those that hold a part of the inside, or -1."""
 
     brick: mi.Int32
     slot: mi.Int32
@@ -56,12 +53,8 @@ class CellIndex:
         self, x: mi.Point3f, first: mi.Int32, counts: mi.Vector3i, active: mi.Bool | bool = True
     ) -> tuple[mi.Int32, mi.Vector3f, mi.Float, mi.Bool]:
         """Slot, place from the centre of the cell in units of its edge, 1 / edge, and whether there is a cell.
-
-        Args:
-            x: points from the corner of a grid, in units of h.
-            first: number of its first brick.
-            counts: of bricks along its axes.
-        """
+        `x`: points from the corner of a grid, in units of h. `first`: number of its first brick. `counts`: of bricks
+        along its axes."""
         # ---- the brick
         whole = mi.Vector3i(dr.floor(x / BRICK))
         held = active & dr.all((whole >= 0) & (whole < counts))
@@ -157,13 +150,9 @@ class InsideCells:
 
     def share(self, sums: mi.Float, n: int, moments: bool = False) -> None:
         """Give cells that share a fit the sum over all of them.
-
-        Args:
-            sums: (slots, n) in a row, of each cell; changed in place.
-            n: numbers of a cell, fours.
-            moments: whether these are ∫ f (1, x, y, z) dx about the centre of each; the sums are about that of the cell
-                whose fit is shared.
-        """
+        `sums`: (slots, n) in a row, of each cell; changed in place. `n`: numbers of a cell, fours. `moments`: whether
+        these are ∫ f (1, x, y, z) dx about the centre of each; the sums are about that of the cell whose fit is
+        shared."""
         for first in range(0, n, 4):
             # ---- four sums by the cell whose fit is shared, moments about the centre of that
             start = self.cut * n + dr.opaque(mi.UInt32, first)
@@ -183,12 +172,8 @@ class InsideCells:
 
     def fit(self, D: mi.Float) -> None:
         """Put the fit of cut cells where their moments are, as such moments as a whole cell of this fit has.
-
-        Those of whole cells stay: `UnscatteredLight` takes the mean from D_0 and slopes from 12 / (1 + RIDGE) D_j.
-
-        Args:
-            D: (slots, channels, 4) in a row, ∫ f x_j dx of each cell, shared by those of one fit; changed in place.
-        """
+        Those of whole cells stay: `UnscatteredLight` takes the mean from D_0 and slopes from 12 / (1 + RIDGE) D_j. `D`:
+        (slots, channels, 4) in a row, ∫ f x_j dx of each cell, shared by those of one fit; changed in place."""
         n = len(mi.Spectrum(0))
         A = [dr.gather(mi.Vector4f, self.solve, 4 * dr.arange(mi.UInt32, dr.width(self.cut)) + i) for i in range(4)]
         found = []
@@ -212,13 +197,8 @@ def cell_edge(
     box: tuple[np.ndarray, np.ndarray], extent: tuple[float, float], h: float, depths: tuple[float, float]
 ) -> float:
     """h, or the least edge of cells that gives an object at most MOST_BRICKS and MOST_SLOTS.
-
-    Args:
-        box: its least and largest coordinates.
-        extent: its area and volume.
-        h: edge that is wanted.
-        depths: as in `InsideCells.of`.
-    """
+    `box`: its least and largest coordinates. `extent`: its area and volume. `h`: edge that is wanted. `depths`: as in
+    `InsideCells.of`."""
     # cells of the box, else fine and coarse ones below the surface: half of the bricks that it cuts, and those near
     area, volume = extent
     while True:
@@ -237,10 +217,7 @@ def _inside(
     counts: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Which cells are inside as a whole, (bricks that the surface cuts, 64), and which of all bricks.
-
-    Args:
-        crossed: which bricks the surface may cut, their numbers, and which of their cells, (bricks, 64).
-    """
+    `crossed`: which bricks the surface may cut, their numbers, and which of their cells, (bricks, 64)."""
     # ---- cells and bricks between the crossed ones are inside or outside all together: a ray from one of them tells
     surface, bricks, cut = crossed
     rows, parts = _connected(~cut)
@@ -270,10 +247,7 @@ def _flags(bits: np.ndarray) -> np.ndarray:
 
 def _connected(free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The parts of bricks whose free cells touch by their faces: the place of the brick of each, and its cells as bits.
-
-    Args:
-        free: (bricks, 64) which cells are free.
-    """
+    `free`: (bricks, 64) which cells are free."""
     left, rows, parts = _bits(free), np.arange(len(free)), []
     edges = [(np.uint64(4**a), _bits((P < 3)[None])[0], _bits((P > 0)[None])[0]) for a, P in enumerate(PLACES)]
     places = []
@@ -297,12 +271,8 @@ def _connected(free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _numbered(held: np.ndarray, fine: np.ndarray, coarse: np.ndarray, bricks: int) -> tuple[CellIndex, np.ndarray, int]:
     """Cells by number, their slots in fine bricks, and how many slots there are.
-
-    Args:
-        held: (fine, 64) which cells of these bricks hold a part of the inside.
-        fine, coarse: numbers of these bricks.
-        bricks: number of all.
-    """
+    `held`: (fine, 64) which cells of these bricks hold a part of the inside. `fine`, `coarse`: numbers of these bricks.
+    `bricks`: number of all."""
     slot = np.where(held, np.cumsum(held, dtype=np.int32).reshape(held.shape) - 1, -1)
     n, last = int(np.count_nonzero(held)), (BRICK // 2) ** 3
     brick = np.full(bricks, -1, dtype=np.int32)
@@ -315,11 +285,8 @@ def _numbered(held: np.ndarray, fine: np.ndarray, coarse: np.ndarray, bricks: in
 
 def _solutions(moments: np.ndarray, place: np.ndarray, offset: np.ndarray) -> np.ndarray:
     """Least squares over the inside, (cut, 4, 4): from moments of f its value at the centre and its slopes by h.
-
-    Args:
-        moments: (cut, 4, 4) m_jk of the inside of cells.
-        place, offset: of the cell whose fit each shares, and the way from its centre.
-    """
+    `moments`: (cut, 4, 4) m_jk of the inside of cells. `place`, `offset`: of the cell whose fit each shares, and the
+    way from its centre."""
     # ---- moments of all that share a fit, about the centre of that cell
     shares = np.flatnonzero(place != np.arange(len(place)))
     shift = np.tile(np.eye(4, dtype=np.float32), (len(shares), 1, 1))
@@ -364,9 +331,7 @@ def _crossed_cells(
     points: SurfaceParts, low: np.ndarray, h: float, counts: np.ndarray, bricks: np.ndarray
 ) -> np.ndarray:
     """The axis nearest to a normal in each cell of bricks, (bricks, 64); -1 where no point reaches.
-
-    It is that of the point whose normal is nearest to an axis.
-    """
+    It is that of the point whose normal is nearest to an axis."""
     place = np.full(int(counts.prod()), -1, dtype=np.int32)
     place[bricks] = np.arange(len(bricks))
     place, best = aligned(mi.Int32, place), dr.zeros(mi.UInt32, BRICK**3 * len(bricks))
@@ -449,10 +414,8 @@ def _measure(
     media: WalkMedia, k: int, cells: np.ndarray, low: np.ndarray, axes: np.ndarray, h: float
 ) -> np.ndarray:  # fmt: skip
     """Moments (cells, 4, 4) of the inside of cells, from columns at jittered places.
-
     They run along the axis nearest to the normal of the surface, in which they are exact: what is left of their noise
-    would make light, divided by the volume of a small part, too bright in the mean.
-    """
+    would make light, divided by the volume of a small part, too bright in the mean."""
     n = len(axes)
     across_cell = COLUMNS[n >= FINE]
     number, edge, axis = dr.opaque(mi.Int32, k, n), opaque(h), aligned(mi.UInt32, axes)

@@ -55,10 +55,8 @@ def _incident(
     scene: mi.Scene, media: WalkMedia, k: int, si: mi.SurfaceInteraction3f, u: mi.Point2f, rng: mi.PCG32
 ) -> tuple[mi.Vector3f, mi.Spectrum]:
     """A direction w to an emitter, and the light from there over its density.
-
-    A share of them is drawn by the cosine, for lamps so near that those of the emitters miss them (balance
-    heuristic over one sample): L / ((1 - BY_COSINE) p_emitter + BY_COSINE p_cosine).
-    """
+    A share of them is drawn by the cosine, for lamps so near that those of the emitters miss them (balance heuristic
+    over one sample): L / ((1 - BY_COSINE) p_emitter + BY_COSINE p_cosine)."""
     instance_scene, rounding = media.instance_scene, media.row("rounding", mi.Int32(k))
 
     # ---- by the emitters, L without its density; delta lights have no other technique

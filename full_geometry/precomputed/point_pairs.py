@@ -27,11 +27,7 @@ ANY = 0.1  # and of them by no light
 
 class Rays(NamedTuple):
     """Directions along which light was gathered at points.
-
-    Args:
-        w: (points, directions, 3).
-        light: a(mu) mu L over their density and number, (points, directions, channels).
-    """
+    `w`: (points, directions, 3). `light`: a(mu) mu L over their density and number, (points, directions, channels)."""
 
     w: np.ndarray
     light: np.ndarray
@@ -39,13 +35,9 @@ class Rays(NamedTuple):
 
 class LitPairs(NamedTuple):
     """Chosen pairs, with light.
-
-    Args:
-        row, number: point of the exit, and number of the entry in those of all points.
-        share: of them over their probability.
-        w: direction of light at the entry, (pairs, 3).
-        colour: light along that over the mean of such light there, (pairs, channels).
-    """
+    `row`, `number`: point of the exit, and number of the entry in those of all points. `share`: of them over their
+    probability. `w`: direction of light at the entry, (pairs, 3). `colour`: light along that over the mean of such
+    light there, (pairs, channels)."""
 
     row: np.ndarray
     number: np.ndarray
@@ -56,12 +48,7 @@ class LitPairs(NamedTuple):
 
 def lit_pairs(brought: np.ndarray, point: np.ndarray, rays: Rays) -> LitPairs:
     """Pairs for light.
-
-    Args:
-        brought: by entries, (points, entries).
-        point: that each is nearest to.
-        rays: to points.
-    """
+    `brought`: by entries, (points, entries). `point`: that each is nearest to. `rays`: to points."""
     # ---- n entries of each point, of probability (1 - ANY) light / Σ light + ANY / entries
     (rows, each), n = brought.shape, max(COUNT // len(brought), FEWEST)
     row = np.repeat(np.arange(rows), n)
@@ -95,13 +82,8 @@ def _systematic(weights: np.ndarray, row: np.ndarray, u: np.ndarray) -> np.ndarr
 
 class EntryPairs(NamedTuple):
     """All entries of points and their exits, on an object without textures.
-
-    Args:
-        object: that both are on.
-        out: exits of points and their faces, given those and directions.
-        w_o: directions, (points, entries, 3).
-        entries: given their numbers.
-    """
+    `object`: that both are on. `out`: exits of points and their faces, given those and directions. `w_o`: directions,
+    (points, entries, 3). `entries`: given their numbers."""
 
     object: TranslucentObject
     out: Callable[[mi.UInt32, mi.Vector3f], tuple[SurfacePoint, mi.UInt32]]

@@ -53,11 +53,7 @@ ONWARD = 0.25  # share of walks that go on beyond FEW events where other surface
 @dataclass
 class LightPath:
     """What a walk from an emitter carries.
-
-    Args:
-        flux: where it began.
-        direct: whether it has not left the object since.
-    """
+    `flux`: where it began. `direct`: whether it has not left the object since."""
 
     flux: mi.Spectrum
     direct: mi.Bool
@@ -66,13 +62,9 @@ class LightPath:
 @dataclass(frozen=True, eq=False)
 class ScatteredLight:
     """Paths from emitters that add ∫ L_s x_j dx dw to cells at their events.
-
-    Args:
-        scene, media: of Mitsuba, and its objects.
-        index: of the cells of all objects.
-        tables: by the number of an object, as of `UnscatteredLight`.
-        D: of each slot and channel ∫ L_s (1, x, y, z) dx dw, x from the centre of the cell by its edge.
-    """
+    `scene`, `media`: of Mitsuba, and its objects. `index`: of the cells of all objects. `tables`: by the number of an
+    object, as of `UnscatteredLight`. `D`: of each slot and channel ∫ L_s (1, x, y, z) dx dw, x from the centre of the
+    cell by its edge."""
 
     scene: mi.Scene
     media: WalkMedia

@@ -44,9 +44,7 @@ FINER = 2.0  # power of detail that no level has, over that of the finest level
 
 def directional(x: Any, y: Any, z: Any, mu: Any) -> list[Any]:
     """Y of a direction of cosine mu: 1, x, y, z, x² - z², y² - z², xy, xz, yz, ((mu - .85) / .15)³, of any arrays.
-
-    Directions inside that refraction reaches have a mu of .7 to 1, for an index of 1.4.
-    """
+    Directions inside that refraction reaches have a mu of .7 to 1, for an index of 1.4."""
     t = (mu - 0.85) * (1 / 0.15)
     return [x * 0 + 1, x, y, z, x * x - z * z, y * y - z * z, x * y, x * z, y * z, t * t * t]
 
@@ -54,13 +52,8 @@ def directional(x: Any, y: Any, z: Any, mu: Any) -> list[Any]:
 @dataclass(frozen=True)
 class ResidualSums:
     """Sums over the residuals of each point.
-
-    Args:
-        number: of residuals, (points,).
-        a: Σ a Y Y^T, (points, terms, terms).
-        r: Σ a Y r / a, (points, terms, channels).
-        light: Σ of the light that residuals are a part of, (channels,).
-    """
+    `number`: of residuals, (points,). `a`: Σ a Y Y^T, (points, terms, terms). `r`: Σ a Y r / a, (points, terms,
+    channels). `light`: Σ of the light that residuals are a part of, (channels,)."""
 
     number: np.ndarray
     a: np.ndarray
@@ -78,9 +71,7 @@ class ResidualSums:
         cls, point: np.ndarray, Y: np.ndarray, a: np.ndarray, r: np.ndarray, light: np.ndarray, points: int
     ) -> ResidualSums:  # fmt: skip
         """Sums of residuals r (n, channels) of light (n, channels) in directions of Y (n, terms) at points.
-
-        Their factors a (n, channels) are above 0.
-        """
+        Their factors a (n, channels) are above 0."""
         # a is the mean over the channels, so that all have the same weights
         weight = a.mean(axis=1)
         outer = (weight[:, None, None] * Y[:, :, None] * Y[:, None, :]).reshape(len(Y), -1)
@@ -107,13 +98,8 @@ def size_of(p: np.ndarray) -> float:
 @dataclass(frozen=True)
 class Level:
     """Centres and the weights of all points about each: one centre without weights for the coarsest level.
-
-    Args:
-        centre: number of the point of each centre.
-        h: reach.
-        size: of the object, the unit of places of features.
-        weights: (centres, points).
-    """
+    `centre`: number of the point of each centre. `h`: reach. `size`: of the object, the unit of places of features.
+    `weights`: (centres, points)."""
 
     centre: np.ndarray
     h: float
@@ -136,11 +122,7 @@ class Level:
 
     def fitted(self, features: np.ndarray, sums: ResidualSums) -> np.ndarray:
         """C at all points, (points, terms, channels); 0 where no centre is in reach.
-
-        Args:
-            features: (points, 1 + U), 1 and x / size and G of each point.
-            sums: of the residuals.
-        """
+        `features`: (points, 1 + U), 1 and x / size and G of each point. `sums`: of the residuals."""
         # ---- moments about each centre, of phi = (1, u, Y): Σ_j W_cj Σ_s a phi phi^T and Σ_j W_cj Σ_s a phi r / a
         N, U = features.shape
         more, of = LOCAL - 1, slice(1, LOCAL)
@@ -197,10 +179,7 @@ def levels(p: np.ndarray, n: np.ndarray, area: float, residuals: float) -> list[
 
 class _Directions:
     """Directions of the residuals of each point, by which fields are compared; where it has none they are not.
-
-    Args:
-        a: Σ a Y Y^T of points, (points, terms, terms).
-    """
+    `a`: Σ a Y Y^T of points, (points, terms, terms)."""
 
     def __init__(self, a: np.ndarray) -> None:
         self._moments = a / np.maximum(a[:, :1, :1], 1e-30)
@@ -244,13 +223,8 @@ def smooth_field(
     of: list[Level], at: tuple[np.ndarray, np.ndarray], G: np.ndarray, halves: tuple[ResidualSums, ResidualSums]
 ) -> tuple[np.ndarray, np.ndarray]:
     """C (points, channels, terms), and its mean squared error (points,), the sum over channels.
-
-    Args:
-        of: levels.
-        at: positions and normals (points, 3).
-        G: a feature (points,), of the order of one.
-        halves: independent residuals.
-    """
+    `of`: levels. `at`: positions and normals (points, 3). `G`: a feature (points,), of the order of one. `halves`:
+    independent residuals."""
     # ---- one fit of all points by the cosine, then what each level adds, filtered
     (p, n), directions = at, _Directions(halves[0].a + halves[1].a)
     features = np.column_stack([np.ones(len(p)), (p - p.mean(axis=0)) / size_of(p), G])

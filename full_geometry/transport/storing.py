@@ -428,7 +428,10 @@ def _checked_base(path: Path, record: dict[str, Any], obj: TranslucentObject) ->
 
 def load(path: str | os.PathLike[str], obj: TranslucentObject) -> Learnt:
     """The model of an object and its sampler from its weights.
-    ValueError if the file is damaged, of another kind or version, or of another object."""
+
+    Raises:
+        ValueError: the file is damaged, of another kind or version, or of another object.
+    """
     path = Path(path)
     identity, arrays, record = _trained(path)
     try:
