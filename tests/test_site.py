@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import functools
+import gzip
 import re
 import subprocess
 import sys
+import threading
 from html.parser import HTMLParser
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from urllib.parse import unquote
+from typing import Any
+from urllib.parse import unquote, urlsplit
 
 import pytest
 
 import halfspace_sss
+from tests.browser import chromium
 
 ROOT = Path(__file__).resolve().parent.parent
 ELSEWHERE = re.compile(r"^(https?:|data:|#|mailto:|javascript:)")
@@ -71,5 +77,68 @@ def test_every_page_says_the_version_and_so_does_the_citation(site: Path) -> Non
     assert f"version: {halfspace_sss.__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
 
 
-def test_the_site_begins_with_a_page(site: Path) -> None:
-    assert "halfspace-sss curves" in (site / "index.html").read_text(encoding="utf-8")
+SEEN = """
+const done = arguments[0], images = [...document.images];
+const loaded = performance.getEntriesByType("resource").map(e => e.name);
+images.forEach(image => image.loading = "eager");
+Promise.all(images.map(image => image.decode().then(() => null, () => image.src))).then(broken =>
+    done([loaded, broken.filter(src => src), document.documentElement.scrollWidth]));
+"""
+SEARCH = """
+const query = document.getElementById("mkdocs-search-query");
+query.value = "ketchup";
+query.dispatchEvent(new Event("keyup"));
+return document.querySelector("#mkdocs-search-results article") !== null;
+"""
+MOST = 1_000_000  # bytes before anybody scrolls, text as compressed as GitHub Pages sends it
+
+
+class _Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+def _size(file: Path) -> int:
+    text = file.suffix in (".html", ".css", ".js", ".json", ".svg")
+    return len(gzip.compress(file.read_bytes(), 6)) if text else file.stat().st_size
+
+
+def _resize(driver: Any, width: int) -> None:
+    metrics = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 600}
+    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+
+
+def test_pages_load_at_once_and_fit_a_phone_and_a_screen(site: Path) -> None:
+    wait = pytest.importorskip("selenium.webdriver.support.wait").WebDriverWait
+    pages = [page for page in sorted(site.rglob("index.html")) if page.parent.name != "flip"]
+    handler = functools.partial(_Quiet, directory=str(site))
+    size = functools.cache(_size)
+    search = sum(size(file) for file in (site / "search").iterdir())  # a worker loads them
+    wrong = []
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server, chromium() as driver:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        home = f"http://127.0.0.1:{server.server_port}/"
+        driver.get(home)
+        wait(driver, 30).until(lambda _: driver.execute_script(SEARCH))
+        driver.execute_cdp_cmd(
+            "Page.addScriptToEvaluateOnNewDocument", {"source": "Worker = class { postMessage() {} }"}
+        )
+        media = {"features": [{"name": "prefers-color-scheme", "value": "dark"}]}
+        driver.execute_cdp_cmd("Emulation.setEmulatedMedia", media)
+        for page in pages:
+            name = page.relative_to(site)
+            _resize(driver, 390)
+            driver.get(home + name.parent.as_posix() + "/")
+            loaded, broken, *wide = driver.execute_async_script(SEEN)
+            _resize(driver, 1280)
+            wide.append(driver.execute_script("return document.documentElement.scrollWidth"))
+            near = {site / unquote(urlsplit(url).path[1:]) for url in loaded if url.startswith(home)}
+            total = size(page) + search + sum(map(size, near))
+            wrong += [f"{name}: broken {src}" for src in broken]
+            wrong += [f"{name}: from elsewhere {url}" for url in loaded if not url.startswith(home)]
+            wrong += [f"{name}: {wide} wide"] * (wide[0] > 390 or wide[1] > 1280)
+            wrong += [f"{name}: {total} bytes"] * (total > MOST)
+        assert driver.execute_script("return document.documentElement.dataset.bsTheme") == "dark"
+        server.shutdown()
+    assert len(pages) > 30
+    assert wrong == []
