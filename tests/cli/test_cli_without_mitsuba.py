@@ -10,7 +10,7 @@ from pathlib import Path
 
 COMMANDS = {
     "--help": [],
-    "curves": ["--paths", "256", "--theta-i", "0", "--model", "neural", "--out", "curves"],
+    "curves": ["--paths", "0", "--theta-i", "0", "--model", "neural", "--out", "curves"],
     "maps": ["--grid", "2,16,4,4", "--paths", "1024", "--out", "maps"],
     "materials list": ["--json"],
     "materials show": ["marble"],
