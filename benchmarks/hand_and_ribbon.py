@@ -1,10 +1,10 @@
-"""Shapes that stand for what users bring, of any material: a hand and a ribbon. Lengths are of the order of one."""
+"""Shapes that stand for what users bring, of any material: hand, ribbon, pawn. Lengths are of the order of 1."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from full_geometry.learning.meshes import Box, Distance, box, capsule, join, margin, twisted
+from full_geometry.learning.meshes import Box, Distance, box, capsule, join, margin, overlap, twisted
 
 Made = tuple[Distance, Box]
 
@@ -35,4 +35,18 @@ def ribbon() -> Made:
     return distance, margin(-np.array(reach), np.array(reach))
 
 
-SHAPES = {f.__name__: f for f in (hand, ribbon)}
+def pawn() -> Made:
+    """A foot with a flat sole, a neck and a head."""
+
+    def distance(p: np.ndarray) -> np.ndarray:
+        foot, neck, head = (
+            capsule(p, (0, low, 0), (0, high, 0), *radii)
+            for low, high, radii in ((-0.12, 0.1, (0.36, 0.2)), (0.1, 0.4, (0.16, 0.1)), (0.55, 0.55, (0.2, 0.2)))
+        )
+        return overlap(join(join(foot, neck, 0.1), head, 0.05), -0.2 - p[..., 1], 0.03)
+
+    return distance, margin((-0.36, -0.2, -0.36), (0.36, 0.76, 0.36))
+
+
+SHAPES = {f.__name__: f for f in (hand, ribbon, pawn)}
+STANDING = ("pawn",)  # on a floor

@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 import pandas
 
-from benchmarks.hand_and_ribbon import SHAPES
+from benchmarks.hand_and_ribbon import SHAPES, STANDING
 from figures.computing.contenders import WALK, ready, volume
 from figures.computing.learnt import object_parts
 from figures.computing.scans import SCANS, prepare, scan_scene, surroundings
@@ -34,7 +34,7 @@ from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import provenance, write_atomically
 
 LIGHTS = ("windows", "lamp and sky")
-OTHER_LIGHTS = ("even sky", "small light")  # the second of scans alone
+ALL_LIGHTS = (*LIGHTS, "even sky", "small light", "sun and sky")
 MODELS = ("full_geometry", "neural_shape", "neural", "better_dipole")
 KINDS = ("sampled", "gathered")
 OVER = ("volpathmis", WALK)
@@ -45,19 +45,23 @@ PASSES = 6
 RESOLUTION = 64  # of modelled objects
 ACROSS = 30.0  # mean free paths, of shapes that any material fills
 EYE, FAR, FOV = (0.35, 0.2, 1.0), 3.5, 34.0  # of these: direction, distance in their sizes / 2, degrees
-LAMP, RADIUS = (0.5, 0.8, 0.6), 0.09  # from the middle, and radius, in sizes of the object
-GLOW, DIM = (60.0, 57.0, 52.0), (0.4, 0.45, 0.5)
+# of a lamp: from the middle of the object and radius, in sizes of it, and radiance
+LAMP = (0.5, 0.8, 0.6), 0.09, (60.0, 57.0, 52.0)
+SMALL = (-0.9, 0.62, -0.6), 0.1, (90.0, 84.0, 75.0)  # behind it, as that of scans
+DIM = (0.4, 0.45, 0.5)
+SUN = (0.5, 0.6, 0.8)  # towards it
+FLOOR = 2.0  # half its side, in sizes of what stands on it
 FRAME, NOISE, IMAGE = 256, 0.01, 512  # pixels of the next frame; noise of an image of so many pixels
 FORMAT = "halfspace-sss speeds 1"
 
 
 @dataclass(frozen=True)
 class LitObject:
-    """An object in a light; ValueError if there is none of that name, or not in that light.
+    """An object in a light; ValueError if there is none of that name.
 
     Args:
         name: "SCAN of MATERIAL", "SHAPE of MATERIAL", "candle" or an object whose medium varies.
-        light: of `LIGHTS` or `OTHER_LIGHTS`.
+        light: of `ALL_LIGHTS`.
     """
 
     name: str
@@ -68,8 +72,6 @@ class LitObject:
         if not (shape in (*SCANS, *SHAPES) if of else shape in VIEWS):
             known = [*(f"{name} of MATERIAL" for name in (*SCANS, *SHAPES)), *VIEWS]
             raise ValueError(f"object must be one of {', '.join(known)}, got {self.name!r}")
-        if self.light == "small light" and shape not in SCANS:
-            raise ValueError(f"object must be a scan ({', '.join(SCANS)}) for the small light, got {self.name!r}")
         _ = self.medium
 
     @property
@@ -108,23 +110,24 @@ class LitObject:
             }
         if self.light == "even sky":
             found["sky"] = {"type": "constant", "radiance": 1.0}
-        if self.light in OTHER_LIGHTS:
-            return found
-        if self.light == "windows":
+        elif self.light == "windows":
             found["sky"] = {"type": "envmap", "bitmap": mi.Bitmap(surroundings())}
-            return found
+        elif self.light == "sun and sky":
+            upright = mi.ScalarTransform4f().rotate([1, 0, 0], -90)
+            found["sky"] = {"type": "sunsky", "sun_direction": list(SUN), "to_world": upright}
+        elif self.light == "lamp and sky":
+            found["lamp"] = self._lamp(found, *LAMP)
+            found["sky"] = {"type": "constant", "radiance": {"type": "rgb", "value": list(DIM)}}
+        elif "lamp" not in found:
+            found["lamp"] = self._lamp(found, *SMALL)
+        return found
+
+    def _lamp(self, found: SceneDict, towards: Sequence[float], radius: float, glow: Sequence[float]) -> SceneDict:
         box = mi.load_dict({k: v for k, v in found[self.key].items() if k != "bsdf"}).bbox()
         across = float(np.linalg.norm(np.array(box.extents())))
-        centre = (np.ravel(np.array(box.center())) + across * np.array(LAMP)).tolist()
-        glow, dim = ({"type": "rgb", "value": list(v)} for v in (GLOW, DIM))
-        found["lamp"] = {
-            "type": "sphere",
-            "center": centre,
-            "radius": RADIUS * across,
-            "emitter": {"type": "area", "radiance": glow},
-        }
-        found["sky"] = {"type": "constant", "radiance": dim}
-        return found
+        centre = (np.ravel(np.array(box.center())) + across * np.array(towards)).tolist()
+        emitter = {"type": "area", "radiance": {"type": "rgb", "value": list(glow)}}
+        return {"type": "sphere", "center": centre, "radius": radius * across, "emitter": emitter}
 
     def _shape(self, size: int, folder: Path) -> SceneDict:
         """A shape of `ACROSS` mean free paths."""
@@ -139,11 +142,19 @@ class LitObject:
         to_world = mi.ScalarTransform4f().look_at(eye.tolist(), centre.tolist(), [0, 1, 0])
         film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
         mm_per_unit = ACROSS / float(np.median(self.medium.sigma_t)) / across
+        floor = {}
+        if self.key in STANDING:
+            # half a thousandth below what stands there: faces that coincide hide each other by chance
+            low = centre - (0, 0.5 * float(np.array(box.extents())[1]) + 5e-4 * across, 0)
+            flat = mi.ScalarTransform4f().translate(low.tolist()).rotate([1, 0, 0], -90).scale(FLOOR * across)
+            grey = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.4}}
+            floor = {"floor": {"type": "rectangle", "to_world": flat, "bsdf": grey}}
         return {
             "type": "scene",
             "integrator": {"type": "bssrdf", "mm_per_unit": mm_per_unit, "hide_emitters": True},
             "sensor": {"type": "perspective", "fov": FOV, "to_world": to_world, "film": film},
             self.key: {**shown, "bsdf": {"type": "translucent", "material": material}},
+            **floor,
         }
 
 

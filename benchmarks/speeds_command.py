@@ -37,7 +37,7 @@ def speeds_command(
     light: Annotated[
         list[str] | None,
         typer.Option(
-            help="windows, lamp and sky, even sky, or small light (of scans); repeat for more.",
+            help="windows, lamp and sky, even sky, small light, or sun and sky; repeat for more.",
             show_default="the first two",
         ),
     ] = None,
@@ -56,10 +56,10 @@ def speeds_command(
     """Measure the speed of models over volpathmis or walks: sampled and gathered."""
     use_mitsuba("llvm_ad_rgb")
     from benchmarks.speeds import (
+        ALL_LIGHTS,
         KINDS,
         LIGHTS,
         MODELS,
-        OTHER_LIGHTS,
         OVER,
         LitObject,
         Measuring,
@@ -72,7 +72,7 @@ def speeds_command(
     for name in models:
         check_choice("model", name, MODELS)
     for name in lights:
-        check_choice("light", name, (*LIGHTS, *OTHER_LIGHTS))
+        check_choice("light", name, ALL_LIGHTS)
     for name in kinds:
         check_choice("kind", name, KINDS)
     check_choice("over", over, OVER)
@@ -120,13 +120,13 @@ def gathered_command(
     """Measure the error that gathered light adds to models, and the errors of both against walks, all orders."""
     use_mitsuba("llvm_ad_rgb")
     from benchmarks.gathered_error import Comparing, gathered_errors, shown
-    from benchmarks.speeds import LIGHTS, MODELS, OTHER_LIGHTS, LitObject
+    from benchmarks.speeds import ALL_LIGHTS, LIGHTS, MODELS, LitObject
 
     models, lights = tuple(model or ("full_geometry", "better_dipole")), tuple(light or LIGHTS)
     for name in models:
         check_choice("model", name, MODELS)
     for name in lights:
-        check_choice("light", name, (*LIGHTS, *OTHER_LIGHTS))
+        check_choice("light", name, ALL_LIGHTS)
     cases = [LitObject(name, each) for name in objects or ("bunny of potato",) for each in lights]
     check_count("samples", samples, 16)
     check_count("size", size, 16)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["time_to_error_command", "total_error_command"]
 
-OBJECTS = ("hand of potato", "ribbon of cream", "bunny of skin1")
+OBJECTS, LIGHTS = ("hand of potato", "ribbon of cream", "bunny of skin1"), ("windows", "lamp and sky")
 Size = Annotated[int, typer.Option(help="Pixels of the square images.", parser=whole)]
 RenderSeed = Annotated[int, typer.Option(help="Seed of all renders.", parser=whole)]
 
@@ -33,16 +33,16 @@ class LitOptions:
         list[str] | None, typer.Option("--object", help="As of `speeds`; repeat for more.", show_default="of the study")
     ] = None
     light: Annotated[
-        list[str] | None, typer.Option(help="As of `speeds`; repeat for more.", show_default="the first two there")
+        list[str] | None, typer.Option(help="As of `speeds`; repeat for more.", show_default="of the study")
     ] = None
 
-    def cases(self, objects: Sequence[str]) -> list[LitObject]:
-        """Each object, or each of `objects` where none is named, in each light; ValueError if there is no such one."""
-        from benchmarks.speeds import LIGHTS, OTHER_LIGHTS, LitObject
+    def cases(self, objects: Sequence[str], lights: Sequence[str]) -> list[LitObject]:
+        """Each object in each light, of those where none is named; ValueError if there is no such one."""
+        from benchmarks.speeds import ALL_LIGHTS, LitObject
 
-        lights = tuple(self.light or LIGHTS)
+        lights = tuple(self.light or lights)
         for name in lights:
-            check_choice("light", name, (*LIGHTS, *OTHER_LIGHTS))
+            check_choice("light", name, ALL_LIGHTS)
         return [LitObject(name, each) for name in self.objects or objects for each in lights]
 
 
@@ -62,7 +62,7 @@ def total_error_command(
     from benchmarks.total_error_plot import draw
     from halfspace_sss.comparison.style import saved
 
-    times, cases = tuple(sorted(seconds or TotalErrors.seconds)), shown.cases(OBJECTS)
+    times, cases = tuple(sorted(seconds or TotalErrors.seconds)), shown.cases(OBJECTS, LIGHTS)
     for value in (*times, reference):
         check_interval("seconds", value, 0.1, 1e6)
     check_count("size", size, 16)
@@ -82,21 +82,16 @@ def total_error_command(
     console().print(text, highlight=False, markup=False, soft_wrap=True)
 
 
-TIMED = tuple(
-    f"{shape} of {material}"
-    for shape, materials in (
-        ("hand", ("potato", "wholemilk")), ("ribbon", ("ketchup", "marble")),
-        ("bunny", ("skin1", "wholemilk", "ketchup")), ("dragon", ("marble", "potato", "skin1")),
-    )
-    for material in materials
-)  # fmt: skip
+TIMED = ("bunny of skin1", "dragon of marble", "hand of potato", "ribbon of ketchup", "pawn of wholemilk")
+TIMED_LIGHTS = ("windows", "lamp and sky", "sun and sky", "small light")
 
 
 def time_to_error_command(
     shown: LitOptions,
     pixels: Annotated[float, typer.Option(help="Relative error of pixels to reach.")] = 0.04,
     blocks: Annotated[float, typer.Option(help="Relative error of means over 8 x 8 pixels to reach.")] = 0.015,
-    most: Annotated[float, typer.Option(help="CPU seconds after which a technique is given up.")] = 60.0,
+    most: Annotated[float, typer.Option(help="CPU seconds after which walks are given up.")] = 60.0,
+    volume: Annotated[float, typer.Option(help="The same of volpathmis.")] = 12.0,
     size: Size = 512,
     seed: RenderSeed = 0,
     out: OutFolder = Path("time_to_error"),
@@ -105,17 +100,17 @@ def time_to_error_command(
     use_mitsuba("llvm_ad_rgb")
     from benchmarks.time_to_error import ErrorsWanted, times_to_error
 
-    cases = shown.cases(TIMED)
+    cases = shown.cases(TIMED, TIMED_LIGHTS)
     for name, value in (("pixels", pixels), ("blocks", blocks)):
         check_interval(name, value, 1e-4, 1.0)
-    check_interval("most", most, 0.1, 1e6)
+    for name, value in (("most", most), ("volume", volume)):
+        check_interval(name, value, 0.1, 1e6)
     check_count("size", size, 16)
     check_count("seed", seed, 0)
     check_folder(out)
     with Bar("time to error") as bar:
-        how = ErrorsWanted(pixels, blocks, most, size, seed)
-        table = times_to_error(cases, how, out / "work", lambda what, k, n: bar.show(k, n, what))
-    text = markdown(table.round(3))
-    csv = table.to_csv(index=False, lineterminator="\n")
-    write_together({out / "time_to_error.csv": csv, out / "time_to_error.md": text})
+        how = ErrorsWanted(pixels, blocks, most, volume, size, seed)
+        for table in times_to_error(cases, how, out / "work", lambda what, k, n: bar.show(k, n, what)):
+            text, csv = markdown(table.round(3)), table.to_csv(index=False, lineterminator="\n")
+            write_together({out / "time_to_error.csv": csv, out / "time_to_error.md": text})
     console().print(text, highlight=False, markup=False, soft_wrap=True)

@@ -49,7 +49,6 @@ def test_an_object_smaller_than_a_block_is_refused() -> None:
         ("teapot of potato", "windows", "object must be one of"),
         ("candle of potato", "windows", "object must be one of"),
         ("hand of marbel", "windows", "material"),
-        ("hand of potato", "small light", "object must be a scan"),
     ],
 )
 def test_an_object_that_there_is_not_is_refused(thing: str, light: str, said: str) -> None:
