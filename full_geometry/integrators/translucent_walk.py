@@ -54,8 +54,10 @@ from halfspace_sss.interrupts import checkpoint, interruptible
 
 PARAMETERS = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters", "connection_share", "blur", "light", "layers")
 SAMPLES_PER_LAUNCH = 2**19
-GLINT, GLINTS, PLACES = 8.0, 128, 8  # least variance over the light, one of so many pixels at most, places in each
-TRIALS, LIT_RAYS = 16, 2**13  # most rays through each pixel that find them; rays that tell the light
+GLINT, GLINTS = 8.0, 128  # least variance over the light, one of so many pixels at most
+PLACES, MOST_PLACES, SHARE = 32, 1024, 4  # least and most in each, for a sample; one for so many samples of the image
+NEAR = 1.5  # steps from pixel to pixel, within which what they mirror may be a rim
+FEWEST_TRIALS, TRIALS, LIT_RAYS = 2, 16, 2**13  # rays through each pixel that find them; rays that tell the light
 LAYER = ["emission.R", "emission.G", "emission.B"]
 SAMPLES_PER_RAY = 4  # of the image, for each ray of light: these take a tenth of the time or less
 SAMPLES_PER_PATH = 8  # the same for each path of scattered light, which takes as long as a few samples
@@ -106,6 +108,7 @@ def _class(variant: str) -> type:
             self._checked: tuple[Any, str] = (None, "")
             self._cells: tuple[Any, list] = (None, [])
             self._kept: tuple[Snapshot | None, UnscatteredLight | None] = (None, None)
+            self._glints: tuple[Any, mi.UInt32 | None] = (None, None)
             self.filling = 0.0
 
         def prepare(self, scene: mi.Scene, samples: int, seed: int = 0) -> None:
@@ -196,8 +199,22 @@ def _class(variant: str) -> type:
             with interruptible(), undisturbed(), dr.suspend_grad():
                 seed = int(mi.UInt32(seed)[0])
                 samples = spp * int(dr.prod(sampled_size(sensor.film())))
-                _render(self.tracer(scene, seed, samples, exits=keep is not None), sensor, seed, spp, keep)
+                tracer = self.tracer(scene, seed, samples, exits=keep is not None)
+                _render(tracer, sensor, seed, spp, keep, False, self._glints_in(scene, tracer, sensor, spp))
                 return sensor.film().develop() if develop else None
+
+        def _glints_in(self, scene: mi.Scene, tracer: PathTracer, sensor: mi.Sensor, spp: int) -> mi.UInt32 | None:
+            """`_glints`, the same for all images of a view; None where that emission is met by chance.
+
+            Only of box filters, which do not ask where in a pixel light is.
+            """
+            if tracer.visitor.unscattered is None or not sensor.film().rfilter().is_box_filter():
+                return None
+            trial = max(FEWEST_TRIALS, min(spp // 8, TRIALS))
+            state = trial, Snapshot.of(sensor), light_state(scene)
+            if self._glints[0] != state:
+                self._glints = state, _glints(tracer, sensor, trial)
+            return self._glints[1]
 
         def sample(
             self,
@@ -340,14 +357,14 @@ def _check_followed(scene: mi.Scene) -> None:
 
 
 def _render(
-    tracer: PathTracer, sensor: mi.Sensor, seed: int, spp: int, keep: Keep | None, scored: bool = False
-) -> None:
+    tracer: PathTracer, sensor: mi.Sensor, seed: int, spp: int, keep: Keep | None, scored: bool = False,
+    glints: mi.UInt32 | None = None,
+) -> None:  # fmt: skip
     """Fill the film of a sensor, in launches between which an interrupt is heard."""
     for obj, inside in zip(tracer.visitor.media.objects, tracer.visitor.media.specs):
         if inside.spectral is not None:
             inside.spectral.check_covers(obj.name, sensor)
     sensor.film().prepare(LAYER if tracer.layers else [])
-    glints = _glints(tracer, sensor, seed, spp)
     # launches are so small that their arrays fit, and that an interrupt is heard between them
     most = max(1, on_device(SAMPLES_PER_LAUNCH) // int(dr.prod(sampled_size(sensor.film()))))
     for number, start in enumerate(range(0, spp, most)):
@@ -394,49 +411,76 @@ def _launch(
 
     # ---- in some pixels, emission in mirrors at many more places
     if glints is not None and dr.width(glints):
-        numbers = path_numbers(seeded(seed[0], 1), dr.width(glints), launch.first * PLACES, spp * PLACES)
+        each = int(dr.prod(sampled_size(sensor.film()))) // (SHARE * dr.width(glints))
+        each = 2 ** (min(max(each, PLACES), MOST_PLACES).bit_length() - 1)
+        numbers = path_numbers(seeded(seed[0], 1), dr.width(glints), launch.first * each, spp * each)
         places, weight, _ = rays_by(sensor, numbers, glints)
         found = weight * tracer.seen_emission(tracer.shown(places))
-        found = mi.Spectrum([dr.block_sum(v, PLACES) / PLACES for v in found])
+        found = mi.Spectrum([dr.block_sum(v, each) / each for v in found])
         for target in (L, emission) if tracer.layers else (L,):
             dr.eval(target)
             dr.scatter_add(target, found, lanes)
     splat(sensor.film(), rays, L, seen, position, spp, list(mi.Color3f(emission)) if tracer.layers else [])
 
 
-def _glints(tracer: PathTracer, sensor: mi.Sensor, seed: int, spp: int) -> mi.UInt32 | None:
-    """Pixels in which emission seen in objects varies much more than other light; None where it is met by chance.
-    Only of box filters, which do not ask where in a pixel light is."""
-    film = sensor.film()
-    if tracer.visitor.unscattered is None or not film.rfilter().is_box_filter():
-        return None
+def _glints(tracer: PathTracer, sensor: mi.Sensor, trial: int) -> mi.UInt32:
+    """Pixels in which emission seen in objects varies much more than other light.
 
-    width, height = (int(v) for v in sampled_size(film))
-    least = None
-
-    # ---- the variance of that emission over a pixel and its neighbours, by more rays where one in each has found some
-    for trial in (1, max(1, min(spp // 8, TRIALS))):
-        numbers = path_numbers(seeded(seed, 3, trial), width * height, 0, trial)
-        rays, weight, _ = rays_by(sensor, numbers)
-        found = np.array(weight * tracer.seen_emission(tracer.shown(rays)), dtype=float)
-        found = found.reshape(-1, height, width, trial)
-        squares, means = (uniform_filter(v.mean(axis=3), (0, 3, 3)) for v in (found**2, found))
+    Args:
+        trial: rays of each pixel that look for it.
+    """
+    width, height = (int(v) for v in sampled_size(sensor.film()))
+    near, most = _near_mirrored(tracer, sensor), width * height // GLINTS
+    pixels = aligned(mi.UInt32, np.arange(width * height, dtype=np.uint32))
+    # of all pixels by few rays those about which it varies most, or may; of these by more rays
+    for rays, wide, kept in ((trial, 5, 2 * most), (PLACES, 3, most)):
+        numbers = path_numbers(seeded(0, 3, rays), dr.width(pixels), 0, rays)
+        places, weight, _ = rays_by(sensor, numbers, pixels)
+        light = np.array(weight * tracer.seen_emission(tracer.shown(places)), dtype=float)
+        light = light.reshape(len(light), -1, rays)
+        if rays == trial:  # other light is not asked for where nothing is seen
+            least = GLINT * _other_light(tracer, sensor) if light.any() or near.any() else np.inf
+        found = np.zeros((2, len(light), height * width))
+        found[..., np.array(pixels)] = light.mean(axis=2), (light**2).mean(axis=2)
+        means, squares = uniform_filter(found.reshape(2, -1, height, width), (0, 0, wide, wide))
         variance = (squares - means**2).sum(axis=0).ravel()
-        if least is None:  # other light is not asked for where nothing is seen
-            least = GLINT * _other_light(tracer, sensor, seed) if found.any() else np.inf
-        number = min(int(np.count_nonzero(variance > least)), len(variance) // GLINTS)
+        variance[near] += np.inf if rays == trial else 0
+        number = min(int(np.count_nonzero(variance > least)), kept)
+        pixels = aligned(mi.UInt32, np.sort(np.argsort(variance)[len(variance) - number :]))
         if number == 0:
             break
-    return aligned(mi.UInt32, np.sort(np.argsort(variance)[len(variance) - number :]))
+    return pixels
 
 
-def _other_light(tracer: PathTracer, sensor: mi.Sensor, seed: int) -> float:
+def _near_mirrored(tracer: PathTracer, sensor: mi.Sensor) -> np.ndarray:
+    """Whether what pixels mirror is as near to the rim of a small emitter as to what the next ones mirror."""
+    width, height = (int(v) for v in sampled_size(sensor.film()))
+    small, result = tracer.visitor.small, np.zeros(width * height, dtype=bool)
+    if small is None:
+        return result
+    rays, _, _ = rays_by(sensor, path_numbers(seeded(0, 4), width * height, 0, 1))
+    o, d, mirrors = tracer.mirrored(tracer.shown(rays))
+    for k in range(small.n_delta, len(small)):
+        k = dr.opaque(mi.UInt32, k)
+        off = np.array(dr.select(mirrors, d - small.direction(k, o)[0], dr.nan)).reshape(3, height, width)
+        step = np.full((height, width), np.nan)
+        for axis in (0, 1):
+            change = np.linalg.norm(np.diff(off, axis=axis + 1), axis=0)
+            ends = [(0, 0), (0, 0)]
+            for ends[axis] in ((0, 1), (1, 0)):
+                step = np.fmax(step, np.pad(change, ends, constant_values=np.nan))
+        rim = np.array(dr.sqrt(small.angle2(k, o)) + dr.zeros(mi.Float, width * height)).reshape(height, width)
+        result |= (np.abs(np.linalg.norm(off, axis=0) - rim) < NEAR * step).ravel()
+    return result
+
+
+def _other_light(tracer: PathTracer, sensor: mi.Sensor) -> float:
     """The mean square of the light of objects without the emission seen in them."""
     pixels = int(dr.prod(sampled_size(sensor.film())))
     pixels = aligned(mi.UInt32, np.linspace(0, pixels - 1, LIT_RAYS).astype(np.uint32))
-    rays, weight, _ = rays_by(sensor, path_numbers(seeded(seed, 2), LIT_RAYS, 0, 1), pixels)
+    rays, weight, _ = rays_by(sensor, path_numbers(seeded(0, 2), LIT_RAYS, 0, 1), pixels)
     apart = dr.opaque(mi.Bool, True, LIT_RAYS)
-    L, hit, _ = replace(tracer, apart=apart).trace(tracer.shown(rays), on_device(PATH_LANES), (seed, 2))
+    L, hit, _ = replace(tracer, apart=apart).trace(tracer.shown(rays), on_device(PATH_LANES), (0, 2))
     light = np.array(weight * L, dtype=float)[:, np.array(hit)]
     return float((light**2).sum() / max(light.shape[1], 1))
 

@@ -9,6 +9,7 @@ index 1 are no vertices (`straight_light`).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -326,8 +327,7 @@ class LightVisitor:
     @property
     def sees_through(self) -> bool:
         """Whether emitters behind objects are found without chance, `emitter_behind`."""
-        light = self.unscattered
-        return light is not None and light.thin and not (self.media.varies or self.media.carried)
+        return self.unscattered is not None and not (self.media.varies or self.media.carried)
 
     def seen_emitters(
         self, walk: Walk, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32, active: mi.Bool, through: mi.Bool
@@ -364,7 +364,8 @@ class LightVisitor:
         d, _ = sided(si, bs.wo)
         active = active & (bs.pdf > 0) & (dr.dot(d, si.n) < 0)
         o, off = media.depart(si, d, mi.Bool(True))
-        ray = mi.Ray3f(o + off, d)
+        ray = mi.Ray3f(o + off, d)  # as far as light is left: at its edges a thick object is thin
+        ray.maxt = -math.log(LEAST_SEEN) / dr.min(media.spectrum("sigma_t", k)) - dr.dot(off, d)
         hit = media.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
         out = media.instance_scene.interaction(hit, ray, media.needed)
         active = active & hit.is_valid() & (media.met(out, k) == k)
@@ -585,6 +586,16 @@ class PathTracer:
         if self.begins_inside:
             return dr.zeros(mi.Spectrum, dr.width(rays))
         return self._mirrored(walk, dr.full(mi.Bool, True, dr.width(rays)), MIRRORS)
+
+    def mirrored(self, rays: mi.Ray3f) -> tuple[mi.Point3f, mi.Vector3f, mi.Bool]:
+        """Where rays go on from the objects that they meet first, along what smooth boundaries mirror; whether any."""
+        media, walk = self.visitor.media, start_walk(rays.o, rays.d, generator(mi, dr.width(rays), pass_seed(0)))
+        si = media.instance_scene.intersect(self.visitor.scene, rays, mi.RayFlags.All)
+        k = media.index_of(si, si.is_valid())
+        near = dr.maximum(k, 0)
+        found = (k >= 0) & media.row("reflects", near) & ~media.row("rough", near) & (not self.begins_inside)
+        walk, found = _along_mirror(media, walk, media.seen(si, k, rays.d), media.boundary_pointer(near), found)
+        return walk.o, walk.d, found
 
     def _mirrored(self, walk: Walk, active: mi.Bool, levels: int) -> mi.Spectrum:
         """Emission in the mirrors of objects that a way along mirrored directions meets, and behind them."""

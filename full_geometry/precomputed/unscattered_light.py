@@ -58,7 +58,6 @@ FEWEST_POINTS, MOST_POINTS = 2**14, 2**18  # of the surface that find its cells,
 MOST_INTEGER = 2**15 - 1  # of 16 bits, for a direction of 1
 MOST_TRUNCATED = 0.5  # abs(g) of media that vary or have textures, above which three coefficients are too few
 FEWEST_PATHS = 2**14  # of scattered light, from each object
-THIN = 8.0  # mean free paths of the mean chord, below which emitters are looked for behind an object
 ROULETTE = 0.1  # part of its light below which a reflected ray may end
 
 
@@ -75,7 +74,6 @@ class UnscatteredLight:
             None where that is left to walks.
         tables: by the number of an object, where its bricks begin, their corner, 1/h and counts.
         forward: whether it has met forward events, see `forward_scattering`.
-        thin: whether an object is so few mean free paths wide that emitters shine through it.
     """
 
     index: CellIndex
@@ -83,7 +81,6 @@ class UnscatteredLight:
     directions: mi.UInt32 | None
     tables: dict[str, Any]
     forward: bool
-    thin: bool = False
     scattered: mi.Float | None = None
 
     def light(self, media: WalkMedia, event: Event, last: mi.Bool | bool = False) -> tuple[mi.Spectrum, mi.Bool]:
@@ -166,9 +163,7 @@ def unscattered_light(
     index = CellIndex(_joined(bricks), _joined(slots))
     light = _joined(fluence), _joined(directions) if directional else None
     dr.make_opaque(tables, index, light)
-    extinctions = [float(np.min(_extinction(media, kind))) for kind in media.instance_table.kind]
-    thin = any(grid.chord * extinction < THIN for grid, extinction in zip(cells, extinctions))
-    found = UnscatteredLight(index, *light, tables, forward(media), thin)
+    found = UnscatteredLight(index, *light, tables, forward(media))
     if paths:
         found = replace(found, scattered=_scattered(scene, media, seed, found, cells, paths))
     dr.sync_thread()  # callers time this
