@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import gzip
+import json
 import re
 import subprocess
 import sys
@@ -15,9 +16,15 @@ from typing import Any
 from urllib.parse import unquote, urlsplit
 
 import pytest
+import yaml
 
 import halfspace_sss
 from tests.browser import chromium
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
 ROOT = Path(__file__).resolve().parent.parent
 ELSEWHERE = re.compile(r"^(https?:|data:|#|mailto:|javascript:)")
@@ -75,6 +82,28 @@ def test_every_page_says_the_version_and_so_does_the_citation(site: Path) -> Non
     said = f"halfspace-sss {halfspace_sss.__version__}, "
     assert [file for file in site.rglob("index.html") if said not in file.read_text(encoding="utf-8")] == []
     assert f"version: {halfspace_sss.__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+
+
+def test_the_recipe_of_conda_asks_for_the_versions_of_the_package() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    recipe = yaml.safe_load((ROOT / "conda" / "recipe" / "recipe.yaml").read_text(encoding="utf-8"))
+    wanted = {each.split(";")[0].strip() for each in project["dependencies"]}
+    wanted = {each for each in wanted if not each.startswith("karellen")} | {f"python{project['requires-python']}"}
+    assert {each.replace(" ", "") for each in recipe["requirements"]["run"]} == wanted
+    found = [each.replace(" ", "") for each in recipe["requirements"]["run_constraints"]]
+    assert found == project["optional-dependencies"]["render"]
+    assert (recipe["package"]["version"], recipe["about"]["license"]) == (project["version"], project["license"])
+
+
+def test_notebooks_install_the_library_and_hold_the_cells_of_their_scripts(site: Path) -> None:
+    scripts = sorted((ROOT / "docs" / "notebooks").glob("*.py"))
+    for script in scripts:
+        cells = json.loads((site / "notebooks" / f"{script.stem}.ipynb").read_text(encoding="utf-8"))["cells"]
+        assert cells[0]["source"].startswith('%pip install "halfspace-sss[')
+        code = [cell["source"] for cell in cells[1:] if cell["cell_type"] == "code"]
+        assert all(each in script.read_text(encoding="utf-8") for each in code)
+        assert "import halfspace_sss" in "".join(code)
+    assert len(scripts) == 3
 
 
 SEEN = """
