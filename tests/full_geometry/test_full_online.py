@@ -214,7 +214,8 @@ def test_what_cannot_be_learnt_is_refused_before_anything_is_traced(
     _refused(monkeypatch, message, _render(*arguments))
 
 
-def test_a_black_scene_is_learnt_and_stays_black() -> None:
+def test_a_black_scene_is_learnt_and_stays_black(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(training, "train", lambda *a, **how: TRAIN(*a, **{**how, "recipe": QUICK, "chunks": 1}))
     Path("ball.xml").write_text(XML.replace('<emitter type="constant"/>', ""))
     result = _render()
     assert result.exit_code == 0 and "every pixel is black" in result.stdout and _weights()
