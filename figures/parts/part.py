@@ -43,10 +43,6 @@ class Result:
     work: float
 
 
-def _no_progress(done: int, total: int) -> None:
-    pass
-
-
 @dataclass(frozen=True)
 class Task:
     """What the function of a part is called with.
@@ -63,7 +59,7 @@ class Task:
     folder: Path
     needed: Mapping[str, Result] = field(default_factory=dict)
     inputs: tuple[Path, ...] = ()
-    progress: Progress = _no_progress
+    progress: Progress = lambda done, total: None
 
 
 Function = Callable[[Task], Params]

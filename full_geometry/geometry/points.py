@@ -517,7 +517,7 @@ class PositionSampler:
         """All hits of a probe as candidates."""
 
         def step(ray: mi.Ray3f, left: mi.UInt32, kept: tuple, active: mi.Bool) -> tuple:
-            si = self.geometry.ray_intersect(ray, _FLAGS(), False, active)
+            si = self.geometry.ray_intersect(ray, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, False, active)
             active &= si.is_valid() & (left > 0)
             same = self.geometry.piece(si.prim_index, active) == piece
             side = self._side(out, si.prim_index, active & same)
@@ -569,10 +569,6 @@ class _Kept(NamedTuple):
 def wrapped(u: mi.Float) -> mi.Float:
     """u modulo one, below one."""
     return dr.minimum(u - dr.floor(u), 1 - 2**-24)
-
-
-def _FLAGS() -> int:
-    return mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
 
 
 def _nowhere() -> tuple:

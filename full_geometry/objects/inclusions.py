@@ -122,10 +122,8 @@ def _meeting(things: InstanceTable, a: int, holders: InstanceTable, b: int) -> _
         a_low, a_high = ends_of(corners(things.shapes[a].bbox(), thing))
         b_low, b_high = ends_of(corners(holders.shapes[b].bbox(), holder))
         deep = DEEP * np.linalg.norm(b_high - b_low, axis=1)
-        e, tells = (
-            [_rounding_of(each, number) for each, number in ((things, a), (holders, b))],
-            _tells(things.shapes[a]),
-        )
+        e = [each.rounding[each.numbers(number)] for each, number in ((things, a), (holders, b))]
+        tells = _tells(things.shapes[a])
         for i in range(len(thing)):
             close = CLOSE * (e[0][i] + e[1][: len(holder)])
             margin = (-close if tells else deep)[:, None]
@@ -225,11 +223,6 @@ def refracts(shape: mi.Shape) -> bool:
 def _tells(shape: mi.Shape) -> bool:
     """Whether rays have to tell the surface of a shape from that of an object, as light comes from behind it."""
     return shape.is_emitter() or bool(surface_of(shape)) or refracts(shape)
-
-
-def _rounding_of(instance_table: InstanceTable, kind: int) -> np.ndarray:
-    """`InstanceTable.rounding` of a shape and its instances."""
-    return instance_table.rounding[instance_table.numbers(kind)]
 
 
 def _check_apart(pairs: _Pairs, of: tuple[mi.Shape, mi.Scene], holder: Geometry, looks: int = LOOKS) -> None:

@@ -25,7 +25,7 @@ from halfspace_sss.backend import array_types
 from halfspace_sss.checks import as_count, check_count, check_interval
 from halfspace_sss.executors import completed
 from halfspace_sss.maps.grid import MapGrid, cell_edges, map_directions
-from halfspace_sss.maps.map_tracing import MapUnit, UnitResult, trace_unit
+from halfspace_sss.maps.map_tracing import MapUnit, trace_unit
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import ProgressText
 from halfspace_sss.provenance import JsonDict, is_remote, naming, one_writer, path_of, provenance
@@ -354,14 +354,10 @@ def _done(path: Path, dataset: xr.Dataset, channel: int, theta: int) -> bool:
 
 
 def _trace_and_write(path: Path, channel: int, unit: MapUnit) -> None:
-    """A part of the work: chunks of its own, which no other unit writes."""
-    _write(path, channel, unit.theta_index, trace_unit(unit))
-
-
-def _write(path: Path, channel: int, theta: int, result: UnitResult) -> None:
-    """The data of a unit, then the checksum that says it is whole."""
+    """Write the data of a unit in chunks of its own, then the checksum that says it is whole."""
     import xarray as xr
 
+    result, theta = trace_unit(unit), unit.theta_index
     dims = ("channel", "theta", "phi", "r", "psi")
     data: dict[str, tuple] = {name: (dims, getattr(result, name)[None, None]) for name in DATA}
     for name, kind in (("n_paths", np.uint64), ("n_events", np.uint64), ("mean_cell_error", float), ("seconds", float)):
