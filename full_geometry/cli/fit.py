@@ -27,7 +27,7 @@ class DescentOptions:
         int, typer.Option(help="Number of steps.", parser=shared.whole, show_default="30; 60: textures")
     ] = 0
     spp: Annotated[int, typer.Option(help="Samples a pixel of each render of a step.", parser=shared.whole)] = 64
-    batch: Annotated[int, typer.Option(help="Views a step.", parser=shared.whole, show_default="4, or all")] = 0
+    batch: Annotated[int, typer.Option(help="Views in each step.", parser=shared.whole, show_default="4, or all")] = 0
     loss: Annotated[Literal["relative", "l2", "robust"], typer.Option(help="Loss of the pixels.")] = "relative"
     exposure: Annotated[bool, typer.Option("--exposure", help="Fit a factor of brightness for each image.")] = False
     tv: Annotated[float, typer.Option(help="Weight of the total variation of textures.")] = 0.02
@@ -46,7 +46,8 @@ class FittedOptions:
     """What is fitted."""
 
     parameter: Annotated[
-        str, typer.Option(help="Any of albedo, reflectance, sigma_t, mfp, g, alpha; textures where it has them.")
+        str,
+        typer.Option(help="Any of albedo, reflectance, sigma_t, mfp, g, alpha; texels where these are textures."),
     ] = "albedo,sigma_t"
     model: Annotated[str, typer.Option(help="translucent_walk, neural_shape, or a model of the half-space.")] = (
         "translucent_walk"

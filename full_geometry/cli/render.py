@@ -98,7 +98,7 @@ class ImageOptions:
     seed: shared.Seed = 0
     sensor: Annotated[str, typer.Option(help="Number of the sensor, several as 0,1, or all.")] = "0"
     denoise: Annotated[
-        bool, typer.Option("--denoise", help="Also write a denoised image; --target-error then is its error.")
+        bool, typer.Option("--denoise", help="Also write a denoised image; --target-error then applies to it.")
     ] = False
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with the unfinished or finished render of the same settings.")
@@ -421,7 +421,7 @@ def view(
     options: SceneOptions,
     host: Annotated[str, typer.Option(help="Address; another than a loopback one asks for a token.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port.")] = PORT,
-    side: Annotated[int, typer.Option(help="Root of the number of pixels.")] = 256,
+    side: Annotated[int, typer.Option(help="Side of a square image of as many pixels.")] = 256,
 ) -> None:
     """Look at a scene in the browser: turn it, move its light, change media and models, until Ctrl-C.
 

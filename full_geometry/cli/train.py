@@ -95,14 +95,14 @@ def _report(learnt: LearntObject) -> None:
 
 def train_shapes(
     mesh: Annotated[
-        list[Path] | None, typer.Option(help="A closed PLY file among the shapes; repeat for more.")
+        list[Path] | None, typer.Option(help="Closed PLY file to draw shapes from, too; repeat for more.")
     ] = None,
     seconds: Seconds = 600.0,
     seed: shared.Seed = 0,
     out: shared.OutFolder = Path("shapes"),
     work: Work = None,
 ) -> None:
-    """Train the network for all shapes and media, on objects that are drawn without end."""
+    """Train the network for all shapes and media on random objects until the time is over."""
     need_torch()
     if find_spec("igl") is None:
         raise ValueError("training on shapes needs libigl: `pip install halfspace-sss[train]`")

@@ -34,9 +34,9 @@ DEFINITION = (
 class MediaOptions:
     """Media without names."""
 
-    registry: Annotated[bool, typer.Option("--registry", help="All registered materials, every channel.")] = False
+    registry: Annotated[bool, typer.Option("--registry", help="Every channel of all registered materials.")] = False
     held_out: Annotated[
-        int | None, typer.Option(help="This many random media over the range of `neural`.", parser=shared.whole)
+        int | None, typer.Option(help="Number of random media over the range of `neural`.", parser=shared.whole)
     ] = None
     as_trained: Annotated[
         bool, typer.Option("--as-trained", help="Draw held-out media as in training: a third with g near 1.")
@@ -301,7 +301,7 @@ def validate(
     out: Annotated[Path | None, typer.Option(help="Folder for validate.csv and validate.json.")] = None,
     seed: Seed = 0,
     quick: Annotated[bool, typer.Option("--quick", help="Ten times looser standard errors.")] = False,
-    rows: Annotated[str | None, typer.Option(help="Only these ids, measures (R_d, BRDF, ...) or kinds.")] = None,
+    rows: Annotated[str | None, typer.Option(help="Rows to trace: ids, measures (R_d, BRDF, ...) or kinds.")] = None,
 ) -> None:
     """Trace every published, third-party or exact half-space number of the packaged table and compare."""
     from halfspace_sss.comparison import truths

@@ -340,7 +340,7 @@ def _complete_materials() -> list[str]:
 MATERIALS_HELP = "Names of materials; see `halfspace-sss materials list`."
 Materials = Annotated[list[str] | None, typer.Argument(help=MATERIALS_HELP, autocompletion=_complete_materials)]
 OneMaterial = Annotated[str | None, typer.Argument(help="Name of a material.", autocompletion=_complete_materials)]
-Channels = Annotated[str | None, typer.Option(help="Only these, as R,B.", show_default="all")]
+Channels = Annotated[str | None, typer.Option(help="Channels, as R,B.", show_default="all")]
 Models = Annotated[
     list[str] | None,
     typer.Option(help="A model; repeat for more.", metavar="NAME", show_default="all", autocompletion=_complete_models),

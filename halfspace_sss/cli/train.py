@@ -38,7 +38,7 @@ class TracingOptions:
     ] = None
     paths: Annotated[
         int | None,
-        typer.Option(help="Walks for 16 maps: this number, or the most with --target-error.", parser=shared.whole),
+        typer.Option(help="Walks for 16 maps; with --target-error their largest number.", parser=shared.whole),
     ] = None
     grid: Annotated[
         str, typer.Option(help="Numbers of angles of incidence, of observations, of cells in r, in azimuth.")
@@ -53,7 +53,7 @@ def maps(
     places: shared.Places,
     material: shared.Materials = None,
     channel: Annotated[
-        str | None, typer.Option(help="Only these, as R,B, a store each.", show_default="all in one store")
+        str | None, typer.Option(help="Channels, as R,B, each in its own store.", show_default="all in one store")
     ] = None,
     name: Annotated[
         str | None, typer.Option(help="Name of the store of a medium given by coefficients.", show_default="medium")
