@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from full_geometry.settings import Capabilities
-from full_geometry.transport.models import MODELS, WALKS, lookup
+from full_geometry.transport.models import CORRECTED, MODELS, WALKS, lookup
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "limits.md"
 HEADING = "| input | "  # of the table in the page
@@ -41,7 +41,8 @@ ROWS: dict[str, Callable[[Capabilities], str]] = {
 def table() -> str:
     """The table as Markdown: a row for what a scene may ask for, a column for each model, and for walks."""
     columns = {"a half-space model": lookup("neural").capabilities}
-    columns |= {f"`{name}`": entry.capabilities for name, entry in MODELS.items()} | {"`translucent_walk`": WALKS}
+    columns |= {f"`{name}`": entry.capabilities for name, entry in MODELS.items()} | {"corrected light": CORRECTED}
+    columns |= {"`translucent_walk`": WALKS}
     lines = [HEADING + " | ".join(columns) + " |", "|---" * (1 + len(columns)) + "|"]
     lines += [f"| {what} | {' | '.join(map(told, columns.values()))} |" for what, told in ROWS.items()]
     return "\n".join(lines) + "\n"

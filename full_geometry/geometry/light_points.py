@@ -70,6 +70,7 @@ class SurfacePoints:
         cells: of the grid along each axis.
         first: of each cell the place in `members` of its first point; one more than cells.
         members: numbers of the points, cell by cell.
+        tables: h, corners, cells, and the first cell in `first`, by the number of an object, of `joined` points.
     """
 
     p: mi.Point3f
@@ -81,26 +82,51 @@ class SurfacePoints:
     cells: np.ndarray
     first: mi.UInt32
     members: mi.UInt32
+    tables: tuple | None = None
 
     @classmethod
     def of(cls, geometry: Geometry, count: int) -> SurfacePoints:
         """`count` points of an object."""
+        return cls.drawn(lambda u: uniform_entries(geometry, u[0], mi.Point2f(u[1], u[2])), geometry.area, count)
+
+    @classmethod
+    def drawn(cls, draw: Callable[[list[mi.Float]], EntrySample], area: float, count: int) -> SurfacePoints:
+        """`count` points of a surface that `draw` makes of three uniform numbers each."""
         # a low-discrepancy set over the area, then points where random places have none in reach
-        u = [floats(v) for v in lattice(count)]
-        p, n, n_out, _, face, _ = uniform_entries(geometry, u[0], mi.Point2f(u[1], u[2]))
+        p, n, n_out, _, face, _ = draw([floats(v) for v in lattice(count)])
         dr.eval(p, n, n_out, face)
-        h = REACH * float(np.sqrt(geometry.area / count))
+        h = REACH * float(np.sqrt(area / count))
         result = cls(p, n, n_out, face, *_grid(np.array(p).T, h))
         for seed in LOOKS:
-            sparse, result = result, result._without_gaps(geometry, seed)
+            sparse, result = result, result._without_gaps(draw, seed)
             if result is sparse:
                 break
         return result
 
-    def _without_gaps(self, geometry: Geometry, seed: int) -> SurfacePoints:
+    @classmethod
+    def joined(cls, parts: Sequence[SurfacePoints]) -> SurfacePoints:
+        """The points of several objects, which lookups tell apart by the number of the object."""
+        # lists of cells and points one after the other; of each object h, low, cells, and where its cells begin
+        starts, cells, members = (np.cumsum([0, *map(int, sizes)]) for sizes in (
+            (len(part) for part in parts), (dr.width(part.first) for part in parts),
+            (dr.width(part.members) for part in parts),
+        ))  # fmt: skip
+        first = aligned(mi.UInt32, np.concatenate([np.array(part.first) + m for part, m in zip(parts, members)]))
+        listed = aligned(mi.UInt32, np.concatenate([np.array(part.members) + s for part, s in zip(parts, starts)]))
+        rows = [type(v)(*(dr.concat([getattr(part, name)[a] for part in parts]) for a in range(3)))
+                for name, v in (("p", parts[0].p), ("n", parts[0].n), ("n_out", parts[0].n_out))]  # fmt: skip
+        rows.append(dr.concat([part.face for part in parts]))
+        dr.make_opaque(rows)
+        h, low = mi.Float([part.h for part in parts]), of_rows(mi.Point3f, np.stack([part.low for part in parts]))
+        counts = mi.Vector3i(*(mi.Int32([int(part.cells[a]) for part in parts]) for a in range(3)))
+        tables = h, low, counts, mi.UInt32(cells[:-1].tolist())
+        dr.make_opaque(tables)
+        return cls(*rows, 0.0, np.zeros(3), np.zeros(3), first, listed, tables)
+
+    def _without_gaps(self, draw: Callable[[list[mi.Float]], EntrySample], seed: int) -> SurfacePoints:
         """With points where random places have none in reach: faces in rows can be in step with the set."""
         u = np.random.default_rng(seed).random((3, PLACES)).astype(np.float32)
-        at = uniform_entries(geometry, floats(u[0]), mi.Point2f(floats(u[1]), floats(u[2])))
+        at = draw([floats(v) for v in u])
         missed = np.flatnonzero(~np.array(self.nearest(at.p, at.n, mi.Bool(True))[1]))
         if not len(missed):
             return self
@@ -122,6 +148,13 @@ class SurfacePoints:
         face = aligned(mi.UInt32, joined[3])
         return SurfacePoints(p, n, n_out, face, *_grid(np.array(p).T, self.h))
 
+    def some(self, kept: np.ndarray) -> SurfacePoints:
+        """Those of these numbers."""
+        index = aligned(mi.UInt32, kept)
+        p, n, n_out, face = (dr.gather(type(v), v, index) for v in (self.p, self.n, self.n_out, self.face))
+        dr.eval(p, n, n_out, face)
+        return SurfacePoints(p, n, n_out, face, *_grid(np.array(p, dtype=float).T, self.h))
+
     def __len__(self) -> int:
         return dr.width(self.p)
 
@@ -136,13 +169,15 @@ class SurfacePoints:
         out = SurfacePoint(dr.gather(mi.Point3f, self.p, k), n, lifted(n_out, n, w), w, mi.Float(1))
         return out, dr.gather(mi.UInt32, self.face, k)
 
-    def blend(self, values: mi.Float, size: int, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool) -> list[mi.Float]:
-        """Values of all points, `size` for each, one after the other, at places with outward normals."""
+    def blend(
+        self, values: mi.Float, size: int, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool, k: mi.Int32 | None = None
+    ) -> list[mi.Float]:
+        """Values of all points, `size` for each, one after the other, at places with outward normals, of object k."""
 
         def add(j: mi.UInt32, w: mi.Float, total: list[mi.Float]) -> list[mi.Float]:
             return [dr.fma(w, dr.gather(mi.Float, values, j * size + c), v) for c, v in enumerate(total)]
 
-        weight, total = self._near(p, n, active, [mi.Float(0)] * size, add)
+        weight, total = self._near(p, n, active, [mi.Float(0)] * size, add, k)
         scale = dr.select(weight > 0, dr.rcp(dr.maximum(weight, 1e-30)), 0)
         return [v * scale for v in total]
 
@@ -181,16 +216,22 @@ class SurfacePoints:
         _, (j, w) = self._near(p, n, active, (mi.UInt32(0), mi.Float(0)), larger)
         return j, w > 0
 
-    def _near(self, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool, state: object, visit: Callable) -> tuple:
+    def _near(
+        self, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool, state: object, visit: Callable, k: mi.Int32 | None = None
+    ) -> tuple:
         """The sum of weights, and the state after `visit(j, w_j, state)` for all points in reach."""
         # ---- the cell of the place, and the points that it lists
-        h = opaque(self.h)
-        cell = [mi.Int32(dr.floor((p[a] - opaque(self.low[a])) / h)) for a in range(3)]
-        counts = [dr.opaque(mi.Int32, int(c)) for c in self.cells]
+        if self.tables is None:
+            h, low, begin = opaque(self.h), [opaque(v) for v in self.low], None
+            counts = [dr.opaque(mi.Int32, int(c)) for c in self.cells]
+        else:
+            h, low, counts, begin = (dr.gather(type(table), table, k, active) for table in self.tables)
+        cell = [mi.Int32(dr.floor((p[a] - low[a]) / h)) for a in range(3)]
         valid = active
         for index, count in zip(cell, counts):
             valid = valid & (index >= 0) & (index < count)
         index = mi.UInt32(dr.select(valid, (cell[2] * counts[1] + cell[1]) * counts[0] + cell[0], 0))
+        index = index if begin is None else index + begin
         begin = dr.gather(mi.UInt32, self.first, index, valid)
         end = dr.gather(mi.UInt32, self.first, index + 1, valid)
 

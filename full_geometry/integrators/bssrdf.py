@@ -95,11 +95,17 @@ def _class(variant: str) -> type:
                 return self._prepared(scene, samples)
 
         def _prepared(self, scene: mi.Scene, samples: int = 1) -> list[TranslucentObject]:
-            objects, light = self._objects.of(scene), self._objects.choices.light
-            if light not in GATHERED_LIGHTS:
-                return objects
-            objects = self.gathering.of(scene, objects, self.settings)
-            return self.corrections.of(scene, objects, self.settings, samples) if light == "corrected" else objects
+            return self._ready(scene, samples)[0]
+
+        def _ready(self, scene: mi.Scene, samples: int = 1) -> tuple[list[TranslucentObject], mi.Integrator | None]:
+            """The objects, and the walks that render them where their light is corrected."""
+            settings, light = self.settings, self.settings.light
+            objects = self.corrections.without_model(scene, settings) if light == "corrected" else None
+            if objects is None:
+                objects, light = self._objects.of(scene), self._objects.choices.light
+                if light in GATHERED_LIGHTS:
+                    objects = self.gathering.of(scene, objects, settings)
+            return objects, self.corrections.of(scene, objects, settings, samples) if light == "corrected" else None
 
         def take_over(self, other: mi.Integrator) -> None:
             """Take the objects of another integrator of this class that differs in light alone."""
@@ -110,6 +116,8 @@ def _class(variant: str) -> type:
             check_parameters(scene)
             check_emitters(scene)
             with dr.suspend_grad():
+                if self.settings.light == "corrected" and self.corrections.without_model(scene, self.settings):
+                    return
                 make_objects(scene, self.settings, choices_of(scene, self.settings, self._objects.choose), without)
 
         def render(
@@ -120,19 +128,24 @@ def _class(variant: str) -> type:
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             with interruptible(), undisturbed(), dr.suspend_grad():
                 samples = checked_samples(sensor, spp) * int(dr.prod(sampled_size(sensor.film())))
-                self._render(scene, self.prepare(scene, samples), sensor, seed, spp)
+                self._render(scene, samples, sensor, seed, spp)
                 return sensor.film().develop() if develop else None
 
         def preview(self, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int) -> mi.TensorXf:
             """The image without new walks for a correction of light: a first look at a scene that has changed."""
             with interruptible(), undisturbed(), dr.suspend_grad():
-                self._render(scene, self.prepare(scene, 0), sensor, seed, spp)
+                self._render(scene, 0, sensor, seed, spp)
                 return sensor.film().develop()
 
-        def _render(
-            self, scene: mi.Scene, objects: list[TranslucentObject], sensor: mi.Sensor, seed: mi.UInt32 | int, spp: int
-        ) -> None:
+        def _render(self, scene: mi.Scene, samples: int, sensor: mi.Sensor, seed: mi.UInt32 | int, spp: int) -> None:
             """Fill the film of a sensor, in launches."""
+            check_parameters(scene)
+            check_emitters(scene)
+            objects, walk = self._ready(scene, samples)
+            if walk is not None:
+                walk.render(scene, sensor, seed, spp, develop=False)
+                return
+
             # ---- proposals for entries of the objects by the light
             for obj in objects:
                 if obj.spectral is not None:
@@ -193,7 +206,9 @@ def _class(variant: str) -> type:
         ) -> tuple[mi.Spectrum, mi.Bool, list]:  # fmt: skip
             check_outermost(scene)
             with undisturbed(), dr.suspend_grad():
-                objects = self._prepared(scene) if self._lit is None else self._lit
+                objects, walk = self._ready(scene) if self._lit is None else (self._lit, None)
+                if walk is not None:
+                    return walk.sample(scene, sampler, ray, medium, active)
                 ray = shown(scene, objects, self.settings, ray)
                 parts, hit, unconnected = trace_paths(scene, objects, self.settings, sampler, ray, active)
                 # the sum of squares tells how much of the variance phase sampling alone brings

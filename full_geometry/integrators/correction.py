@@ -1,13 +1,18 @@
-"""Gathered light corrected by random walks that start on the surface, the same for all views.
+"""Light that leaves objects, by random walks that start on their surfaces: the same for all views.
 
-Light L_g that a model and `gathering` give has a bias that no time lowers. With W the light of a random walk that goes
-in at x_o against w_o, both without what the boundary reflects at x_o,
+Deep light is that of paths which are scattered twice at least once they have gone in, before they meet anything but the
+boundary. With W that of a random walk that goes in at x_o against w_o, without what the boundary reflects at x_o, and
+L_g what a model and `gathering` give for it, which has a bias that no time lowers,
 
     L_o = L_g + a(w_o) C(x_o, w_o),    a C = E[W - L_g].
 
 C, a polynomial of w_o bent by the boundary, is smooth where the model has the detail of light. It is fitted to W - L_g
 at random places and directions (`precomputed.surface_regression`). It stays until light or objects change; more walks
-make it finer. Walks find light precomputed where that is possible (`precomputed.unscattered_light`).
+make it finer. Walks find light precomputed where that is possible (`precomputed.unscattered_light`). All other light is
+traced by the walks of the image, which end at their second event (`walk_paths`).
+
+No model knows what lies inside an object, what overlaps it, or where its instances stand: L_g is then 0 and a that of
+the reflectance of the medium, so that C is all deep light.
 
 Not corrected: detail that is finer than the distance of points, and C beyond its second degree in w_o, or the third of
 its cosine.
@@ -22,28 +27,33 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.geometry.light_points import GOLDEN, lattice, uniform_entries
-from full_geometry.geometry.points import cosine_above, floats, place
+from full_geometry.geometry.light_points import GOLDEN, SurfacePoints, lattice
+from full_geometry.geometry.points import cosine_above, floats, place, surface_point
 from full_geometry.geometry.rounding import ray_from
+from full_geometry.geometry.shape import analyse_shape, is_inside
 from full_geometry.geometry.snapshot import same_objects
-from full_geometry.integrators.gathering import Gathered
+from full_geometry.integrators.gathering import Gathered, OutgoingLight, light_state
 from full_geometry.integrators.inner_light import cut_to_next
-from full_geometry.integrators.surface_paths import exit_at, trace_paths
 from full_geometry.integrators.walk_paths import PathTracer
-from full_geometry.precomputed.lit_points import R_4
+from full_geometry.objects.objects import TranslucentObject
+from full_geometry.precomputed.lit_points import R_4, entries, to_world
 from full_geometry.precomputed.surface_regression import ResidualSums, directional, levels, smooth_field
-from full_geometry.precomputed.transport_matrix import bent
+from full_geometry.precomputed.transport_matrix import Albedo, bent, count_of
+from full_geometry.surface.varying import equivalent
+from full_geometry.surface.wrapped import surface_of
+from full_geometry.transport.models import lookup
+from full_geometry.walk.media import WalkMedia, sent_back
 from full_geometry.walk.random_walk import PATH_LANES
 from halfspace_sss.backend import clock
 from halfspace_sss.interrupts import checkpoint
 
 if TYPE_CHECKING:
-    from full_geometry.objects.objects import TranslucentObject
     from full_geometry.settings import Settings
 
 PER_LAUNCH = 2**16  # walks
 FEWEST, MOST = 2**17, 2**22  # walks of an object
 SAMPLES_PER_WALK = 8  # of the image
+MOST_PLACES = 64  # of objects and their instances
 ROOTS = (*R_4, GOLDEN)  # not the fifth power of the same root: directions would lie on a line, as 1/g⁴ + 1/g⁵ = 1
 LEAST_ALBEDO = 1e-6
 BRIGHTEST = 1 / 16384  # of the residuals of a launch, which are as bright as the next
@@ -56,6 +66,7 @@ class SurfaceCorrection:
 
     Args:
         gathered: light that is corrected.
+        area: of the object.
         halves: sums of independent residuals.
         launches: of walks that they are of.
         values: C at the points times `scale_of` the light, (points, channels, terms).
@@ -63,6 +74,7 @@ class SurfaceCorrection:
     """
 
     gathered: Gathered
+    area: float
     halves: tuple[ResidualSums, ResidualSums]
     launches: int
     values: np.ndarray
@@ -74,18 +86,20 @@ class SurfaceCorrection:
         return int(sum(half.number.sum() for half in self.halves))
 
     @classmethod
-    def of(cls, gathered: Gathered, halves: tuple[ResidualSums, ResidualSums], launches: int) -> SurfaceCorrection:
+    def of(
+        cls, gathered: Gathered, area: float, halves: tuple[ResidualSums, ResidualSums], launches: int
+    ) -> SurfaceCorrection:
         """The regression of residuals."""
-        points, geometry = gathered.points, gathered.object.geometry
+        points = gathered.points
         p, n, n_out = (np.array(v, dtype=float).T for v in (points.p, points.n, points.n_out))
         B = np.array(gathered.values, dtype=float).reshape(len(points), -1, gathered.terms)
         G = B[:, :, 0].mean(axis=1)
         G = (G - G.mean()) / max(float(G.std()), 1e-12 + 1e-3 * float(np.abs(G).mean()))
-        found = levels(p, n, geometry.area, float(sum(half.number.sum() for half in halves)))
+        found = levels(p, n, area, float(sum(half.number.sum() for half in halves)))
         C, squared = smooth_field(found, (p, n_out), G, halves)
         # RMS over points, over the mean of all light that leaves
         whole = np.square((halves[0] + halves[1]).mean).sum()
-        return cls(gathered, halves, launches, C, float(np.sqrt(squared.mean() / whole)) if whole > 0 else 0.0)
+        return cls(gathered, area, halves, launches, C, float(np.sqrt(squared.mean() / whole)) if whole > 0 else 0.0)
 
     @property
     def corrected(self) -> Gathered:
@@ -114,19 +128,52 @@ class Corrections:
 
     def __init__(self, part: int = 0) -> None:
         self._part = part
-        self._gathered: list[Gathered] = []
+        self._walk: mi.Integrator | None = None
+        self._alone: tuple = (None, None, [])
+        self._gathered: list[Gathered | None] = []
         self._known: list[SurfaceCorrection | None] = []
-        self._found: list[TranslucentObject] = []
         self.seconds = 0.0
+
+    def walk(self, settings: Settings) -> mi.Integrator:
+        """The integrator of the walks."""
+        if self._walk is None:
+            self._walk = mi.load_dict({"type": "translucent_walk", **settings.shared()})
+            self._walk.ends = True
+        return self._walk
+
+    def without_model(self, scene: mi.Scene, settings: Settings) -> list[TranslucentObject] | None:
+        """The objects of a scene, each at one place, where no model has light of them; None where models have it.
+
+        Raises:
+            ValueError: they are at too many places, or one is open.
+        """
+        if mi.is_spectral:  # refused with models
+            return None
+        media = self.walk(settings).media(scene)
+        if not _exceeds_models(media, settings):
+            return None
+        state = light_state(scene)
+        if self._alone[0] is not media or self._alone[1] != state:
+            places = len(media.instance_table)
+            if places > MOST_PLACES:
+                raise ValueError(
+                    f"objects and their instances must be at {MOST_PLACES} places at most for corrected light, which "
+                    f"is kept by place, got {places}: translucent_walk takes more"
+                )
+            for obj in media.objects:
+                if not obj.closed:
+                    raise ValueError(f"light must be sampled for object {obj.name}, which is not closed, got corrected")
+            self._alone = media, state, [_without_light(media, k, scene) for k in range(places)]
+        return self._alone[2]
 
     def of(
         self, scene: mi.Scene, objects: list[TranslucentObject], settings: Settings, samples: int
-    ) -> list[TranslucentObject]:
-        """The objects with corrected light.
+    ) -> mi.Integrator | None:
+        """The integrator of walks that end by corrected light; None where that is not known.
 
         Args:
             scene: of Mitsuba.
-            objects: with gathered light.
+            objects: with gathered light, or of `without_model`, whose light is never left unknown.
             settings: of the integrator.
             samples: of the image, which set the number of walks; 0 leaves light as it is known.
 
@@ -134,40 +181,108 @@ class Corrections:
             ValueError: the light of an object cannot be corrected.
         """
         # ---- what is known still holds for the same gathered light, which changes with light and objects
-        started, gathered = clock(), [obj.gathered for obj in objects]
+        started, walk, alone = clock(), self.walk(settings), objects is self._alone[2]
+        media = walk.media(scene)
         for obj in objects:
-            _check(obj)
+            _check(obj, settings, alone)
+        gathered = [obj.gathered for obj in objects]
+        if not alone:  # by the numbers of walks, which know what lies inside too
+            by_shape = {id(obj.geometry.shape): obj.gathered for obj in objects}
+            gathered = [by_shape.get(id(each.shape)) for each in media.objects]
         if not same_objects(gathered, self._gathered):
-            self._gathered, self._known = gathered, [None] * len(objects)
-        if not samples:
-            return objects if None in self._known else self._found
+            self._gathered, self._known, walk.outgoing = gathered, [None] * len(gathered), None
+        if not samples and not alone:
+            return walk if walk.outgoing is not None else None
 
         # ---- walks that are missing, in two halves
         number = int(np.clip(samples // SAMPLES_PER_WALK, FEWEST, MOST))
         launches = 2 * round(number / (2 * PER_LAUNCH))
-        if any(known is None or known.launches < launches for known in self._known):
-            walk = mi.load_dict({"type": "translucent_walk", **settings.shared()})
-            tracer = replace(walk.tracer(scene, SEED, 4 * number), begins_inside=True)
-            for k, known in enumerate(self._known):
+        missing = [k for k, g in enumerate(gathered) if g and (self._launches(k) < launches)]
+        if missing or walk.outgoing is None:
+            walk.outgoing = None
+            tracer = walk.tracer(scene, SEED, 4 * number)
+            tracer = replace(tracer, visitor=replace(tracer.visitor, deep=True))
+            for k in missing:
+                known = self._known[k]
                 first, halves = (known.launches, list(known.halves)) if known else (0, _nothing(gathered[k]))
                 for launch in range(first, launches):
                     checkpoint()
                     seed = SEED + 10_000 * k + 1_000_000 * self._part + launch
-                    halves[launch % 2] += residuals(scene, objects, settings, tracer, k, seed)
-                self._known[k] = SurfaceCorrection.of(gathered[k], tuple(halves), launches)
-            self._found = [replace(obj, gathered=known.corrected) for obj, known in zip(objects, self._known)]
+                    halves[launch % 2] += residuals(tracer, k, gathered[k], seed)
+                area = known.area if known else area_of(media, k)
+                self._known[k] = SurfaceCorrection.of(gathered[k], area, tuple(halves), launches)
+            outgoing = OutgoingLight.of(media, [known and known.corrected for known in self._known])
+            walk.take(scene, outgoing, tracer.visitor.unscattered)
             self.seconds = clock() - started
-        return self._found
+        return walk
+
+    def _launches(self, k: int) -> int:
+        return self._known[k].launches if self._known[k] else 0
 
     def told(self) -> list[str]:
         """A line for each object: walks, and error."""
         return [known.told for known in self._known if known is not None]
 
 
-def _check(obj: TranslucentObject) -> None:
-    """ValueError if there is no light of an object to correct, or walks would not all go in where they begin."""
-    reason = "it leaves the model where it has entered" if obj.gathered is None else ""
-    reason = "the surface has a mask or is blended with another" if obj.wrapping.mixes else reason
+def _exceeds_models(media: WalkMedia, settings: Settings) -> bool:
+    """Whether instances show objects, they overlap, or their models do not take what lies inside."""
+    models = {settings.model or spec.model for spec in media.specs}
+    taken = media.inner is None or all(lookup(model).capabilities.inclusions for model in models)
+    return media.instance_table.repeated or media.overlaps or not taken
+
+
+def area_of(media: WalkMedia, k: int) -> float:
+    """The area of object k where it stands: the mean of the inverse density of its points."""
+    return float(dr.mean(entries(media, k, [floats(v) for v in lattice(2**14)]).weight)[0])
+
+
+def _without_light(media: WalkMedia, k: int, scene: mi.Scene) -> TranslucentObject:
+    """Object k with points and a factor by its reflectance in place of gathered light; without, inside another."""
+    # ---- the object, with a medium of each channel, 1/(scene unit)
+    kind = int(media.instance_table.kind[k])
+    geometry, spec = media.objects[kind], media.specs[kind]
+    channels = equivalent(spec, geometry).channels()
+    textured = None if spec.textured is None else spec.textured.scaled(media.mm_per_unit)
+    obj = TranslucentObject(geometry, tuple(m.scaled(media.mm_per_unit) for m in channels), textured=textured)
+
+    # ---- points, none of them inside of others
+    area = area_of(media, k)
+    points = SurfacePoints.drawn(lambda u: entries(media, k, u), area, count_of(obj, area))
+    p, hidden = np.array(points.p, dtype=float), np.zeros(len(points), dtype=bool)
+    for j, other in _around(media, scene):
+        if j != k:
+            hidden |= is_inside(other[0], np.linalg.inv(other[1])[:3] @ np.vstack([p, np.ones(p.shape[1])]))
+    if hidden.all():
+        return obj
+    points = points.some(np.flatnonzero(~hidden))
+
+    # ---- a = F_t times the reflectance, which textures give at each exit
+    R = [1.0] * len(channels) if textured else [float(sent_back(np, m.albedo, m.g)) for m in channels]
+    albedo = Albedo(np.outer(R, [1.0, 0.0, 0.0]), float(channels[0].eta))
+    values = floats(np.zeros(len(points) * len(channels)))
+    return replace(obj, gathered=Gathered(obj, points, albedo, values, None))
+
+
+def _around(media: WalkMedia, scene: mi.Scene) -> list[tuple[int, tuple]]:
+    """The objects, and glass that overlaps them, by number, each with its geometry and the place where it stands."""
+    table = media.instance_table
+    found = [(k, (media.objects[int(table.kind[k])], to_world(media, k))) for k in range(len(table))]
+    if media.overlaps:
+        holders = media.inner.priorities.instance_table
+        for k in media.inner.priorities.members():
+            if k >= len(table):
+                kind = int(holders.kind[k])
+                place = holders.to_world(kind)[k - int(holders.first[kind])]
+                found.append((int(k), (analyse_shape(holders.shapes[kind], scene), place)))
+    return found
+
+
+def _check(obj: TranslucentObject, settings: Settings, alone: bool) -> None:
+    """ValueError if there is no light of an object to correct, or other orders are asked for than its surface has."""
+    reason = "it leaves the model where it has entered" if obj.gathered is None and not alone else ""
+    orders = surface_of(obj.geometry.shape).spec.orders
+    if settings.orders not in ("", orders):
+        reason = f"walks take the orders of the surface, {orders!r}"
     if reason:
         raise ValueError(f"light of object {obj.geometry.name} must be sampled, got corrected: {reason}")
 
@@ -176,39 +291,36 @@ def _nothing(gathered: Gathered) -> list[ResidualSums]:
     return [ResidualSums.zeros(len(gathered.points), dr.size_v(mi.Spectrum))] * 2
 
 
-def residuals(
-    scene: mi.Scene, objects: list[TranslucentObject], settings: Settings, tracer: PathTracer, k: int, seed: int
-) -> ResidualSums:
+def residuals(tracer: PathTracer, k: int, gathered: Gathered, seed: int) -> ResidualSums:
     """W - L_g of object k at `PER_LAUNCH` random places and directions, summed by points.
 
     Args:
-        scene: of Mitsuba.
-        objects: with gathered light.
-        settings: of the integrator.
-        tracer: of walks that go in where they begin.
+        tracer: of deep light.
         k: number of the object.
+        gathered: its light.
         seed: of places and walks.
     """
     # ---- places uniform over the area, directions by the cosine, of one lattice
-    obj, gathered = objects[k], objects[k].gathered
+    media, scene = tracer.visitor.media, tracer.visitor.scene
     u = lattice(PER_LAUNCH, ROOTS, np.random.default_rng(seed).random(5))
     u = [floats(np.minimum(v, 1 - 2**-24)) for v in u]
-    at = uniform_entries(obj.geometry, u[0], mi.Point2f(u[1], u[2]))
+    at = entries(media, k, u[:3])
     w, _ = cosine_above(at.n_out, at.n, mi.Point2f(u[3], u[4]))
-    ray = ray_from(place(at.p, at.n), w, obj.geometry.clearance)
+    number = dr.opaque(mi.Int32, k)
+    ray = ray_from(place(at.p, at.n), w, media.row("rounding", number))
     ray = mi.Ray3f(ray.o, -w)
-    si = obj.instance_scene.intersect(scene, ray, mi.RayFlags.All)
-    met, out = si.is_valid() & (si.shape == mi.ShapePtr(obj.geometry.shape)), exit_at(obj, si)
+    si = media.instance_scene.intersect(scene, ray, mi.RayFlags.All)
+    met = si.is_valid() & (media.index_of(si, si.is_valid()) == number)
+    if media.overlaps:
+        met &= _bare(media, media.instance_scene.intersect(scene, mi.Ray3f(ray.o, w), mi.RayFlags.All), w)
+    si = media.seen(si, number, -w)
+    out = surface_point(si.p, si.n, si.sh_frame.n, w)._replace(medium=gathered.object.medium_at(si))
     dr.eval(ray, out, met)
 
-    # ---- W of a walk, and L_g = a B with order 1; order 0, which is exact where it is traced, is in neither
-    passes = 0 not in obj.low_orders
-    W, _, _ = replace(tracer, passes=passes).trace(ray, PATH_LANES, (seed,))
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(seed, PER_LAUNCH)
-    parts, *_ = trace_paths(scene, objects, settings, sampler, ray, mi.Bool(True), passes=passes)
+    # ---- W of a walk, and L_g = a B
+    W, _, _ = tracer.trace(ray, PATH_LANES, (seed,))
     a = gathered.factor(out, met)
-    r = W - gathered.radiance(out, met) - parts[1]
+    r = W - gathered.radiance(out, met)
     point, near = gathered.points.nearest(out.p, out.n, met)
     bent_w = bent(out.w, out.n_out, gathered.albedo.eta)
     mu = dr.dot(bent_w, out.n_out)
@@ -217,7 +329,9 @@ def residuals(
     dr.eval(a, r, W, point, near, bent_w, mu)
 
     if not dr.all(dr.isfinite(dr.sum(r)))[0]:
-        raise ValueError(f"light of walks at object {obj.geometry.name} must be finite, got NaN or infinity")
+        raise ValueError(
+            f"light of walks at object {gathered.object.geometry.name} must be finite, got NaN or infinity"
+        )
 
     # ---- sums over the residuals of each point
     kept = np.array(near) & (np.array(a).min(axis=0) > LEAST_ALBEDO)
@@ -226,6 +340,13 @@ def residuals(
     r = _steadied(r, a)
     Y = np.stack(directional(*bent_w.T, np.array(mu, dtype=float)[kept]), axis=1)
     return ResidualSums.of(np.array(point)[kept], Y, a, r, W, len(gathered.points))
+
+
+def _bare(media: WalkMedia, beyond: mi.SurfaceInteraction3f, w: mi.Vector3f) -> mi.Bool:
+    """Whether a ray along w that meets `beyond` began outside of all that overlaps."""
+    number = media.inner.priorities.instance_table.number(beyond, beyond.is_valid())
+    beyond = media.seen(beyond, media.index_of(beyond, beyond.is_valid()), w)
+    return (number < 0) | (dr.dot(beyond.n, w) < 0)
 
 
 def _steadied(r: np.ndarray, a: np.ndarray) -> np.ndarray:

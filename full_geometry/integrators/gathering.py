@@ -22,7 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.geometry.light_points import GOLDEN, SurfacePoints
-from full_geometry.geometry.points import cosine_above, floats, of_rows, opaque, place
+from full_geometry.geometry.points import cosine_above, floats, of_rows, opaque, place, surface_point
 from full_geometry.geometry.rounding import blocked, ray_from
 from full_geometry.geometry.snapshot import Snapshot, same_objects
 from full_geometry.integrators.fine_light import fine_light
@@ -31,7 +31,7 @@ from full_geometry.integrators.lighting import EnvironmentMean, Lights
 from full_geometry.integrators.surface_paths import trace_paths
 from full_geometry.precomputed.inner import Events, InnerLight, has_inner_light
 from full_geometry.precomputed.point_pairs import Rays
-from full_geometry.precomputed.surface_regression import directional
+from full_geometry.precomputed.surface_regression import TERMS, directional
 from full_geometry.precomputed.transport_matrix import (
     SEED,
     Albedo,
@@ -43,6 +43,7 @@ from full_geometry.precomputed.transport_matrix import (
     transport_matrix,
 )
 from full_geometry.walk.emission import emitter_pdf, mis_weight, sample_emitter
+from full_geometry.walk.media import WalkMedia, sent_back
 from halfspace_sss.backend import clock
 from halfspace_sss.interrupts import checkpoint
 
@@ -66,13 +67,15 @@ TRACED = 8  # one of so many directions by the cosine is traced further, where i
 class Gathered:
     """Radiance of orders from two on that leaves an object in the light of a scene.
 
+    Without a transport of the object it is 0, and `factor` that of its reflectance.
+
     Args:
         object: that the light leaves.
         points: where B is known.
         albedo: a(mu).
         values: B of all points, for each channel the first terms of `directional` in w_o bent by the boundary.
         inner: at events of order 1 inside; None where that order is traced.
-        matrix: transport matrix of the model.
+        matrix: transport matrix of the model; None without one.
         light: that arrives, less c.
         parts: independent estimates of it.
         c: mean radiance of the environment where alpha is known, else 0, see `lighting.EnvironmentMean`.
@@ -83,8 +86,8 @@ class Gathered:
     albedo: Albedo
     values: mi.Float
     inner: InnerLight | None
-    matrix: TransportMatrix
-    light: Incident
+    matrix: TransportMatrix | None = None
+    light: Incident | None = None
     parts: tuple[Incident, ...] = ()
     c: np.ndarray | float = 0.0
 
@@ -108,6 +111,9 @@ class Gathered:
     def factor(self, out: SurfacePoint, active: mi.Bool) -> mi.Spectrum:
         """L_o / B of an exit: a(w_o) R^e, or alpha in the channels where the model knows its directional albedo."""
         mu = dr.maximum(dr.dot(out.w, out.n_out), 0)
+        if self.object.transport is None:
+            g = mi.Spectrum([opaque(m.g) for m in self.object.media])
+            return self.albedo(mu) * (sent_back(dr, out.medium.albedo, g) if out.medium else 1)
         paint = None if self.object.textured is None else self.object.transport.paint(out)
         a = self.albedo(mu, paint)
         if paint is not None:
@@ -144,6 +150,57 @@ class Gathered:
         return float((0.5 * by_light + PART * by_matrix) / whole) if whole > 0 else 1.0
 
 
+@dataclass(frozen=True, eq=False)
+class OutgoingLight:
+    """Light that leaves objects at their surfaces, looked up by walks: a(w_o) max(B.Y(w_o), 0), without reflection.
+
+    Args:
+        media: the objects as walks know them.
+        lights: of each by its number; None of those that no path enters from outside.
+        known: whether there is light of an object, by its number.
+        points: of all of them, joined.
+        values: B of these, for each channel the terms of `directional`.
+    """
+
+    media: WalkMedia
+    lights: list[Gathered | None]
+    known: mi.Bool
+    points: SurfacePoints
+    values: mi.Float
+
+    @classmethod
+    def of(cls, media: WalkMedia, lights: list[Gathered | None]) -> OutgoingLight:
+        """The light of objects, each with all terms of `directional`."""
+        some = [light for light in lights if light is not None]
+        none = replace(some[0].points, h=1.0, first=dr.zeros(mi.UInt32, int(some[0].points.cells.prod()) + 1))
+        points = SurfacePoints.joined([none if light is None else light.points for light in lights])
+        values = dr.concat([(light or some[0]).values for light in lights])
+        known = mi.Bool([light is not None for light in lights])
+        dr.make_opaque(values, known)
+        return cls(media, lights, known, points, values)
+
+    def radiance(
+        self, si: mi.SurfaceInteraction3f, k: mi.Int32, w: mi.Vector3f, active: mi.Bool
+    ) -> tuple[mi.Bool, mi.Spectrum]:
+        """Whether light that leaves object k is known, and that along w from a point with normals outwards."""
+        # B.Y(w), w bent by the boundary
+        active = active & dr.gather(mi.Bool, self.known, self.media.place_of(k))
+        out, size = surface_point(si.p, si.n, si.sh_frame.n, w), dr.size_v(mi.Spectrum)
+        B = self.points.blend(self.values, TERMS * size, out.p, out.n, active, self.media.place_of(k))
+        bent_w, L = bent(w, out.n_out, self.media.row("eta", k)), mi.Spectrum(0)
+        Y = directional(bent_w.x, bent_w.y, bent_w.z, dr.dot(bent_w, out.n_out))
+        B = mi.Spectrum([sum(b * y for b, y in zip(B[TERMS * c :], Y)) for c in range(size)])
+
+        # a(w) of each object, with the medium that textures have here
+        for kind in range(len(self.media.objects)):
+            light = next((self.lights[k] for k in self.media.instance_table.numbers(kind) if self.lights[k]), None)
+            if light is not None:
+                here = active & self.media.has_shape(k, kind)
+                a = light.factor(out._replace(medium=light.object.medium_at(si)), here)
+                L = dr.select(here, a * dr.maximum(B, 0), L)
+        return active, dr.select(dr.dot(w, out.n_out) > 0, L, 0)
+
+
 class Gathering:
     """Gathered light of the objects of a scene, kept until something in the scene changes.
 
@@ -175,7 +232,7 @@ class Gathering:
             spread = [spreads(obj) for obj in objects]
             for obj, one in zip(objects, spread):
                 if one:
-                    _check(obj)
+                    _check(obj, settings.light)
             started = clock()
             share = PART if self._part else 1.0
             seed = SEED + self._part + 10 * self._seed
@@ -216,13 +273,13 @@ def spreads(obj: TranslucentObject) -> bool:
     return obj.transport is not None and not obj.transport.is_delta and not obj.repeated
 
 
-def _check(obj: TranslucentObject) -> None:
-    # points have one side, and their number comes from the area; maps bend normals between them
+def _check(obj: TranslucentObject, light: str) -> None:
+    # points have one side, and their number comes from the area; maps bend normals between them, which walks correct
     result = obj.geometry
     if not result.closed or not result.area > 0:
         lacks = "is not closed" if not result.closed else f"is a {result.shape.class_name()} without known area"
         raise ValueError(f"light must be sampled for object {result.name}, which {lacks}, got gathered")
-    if obj.wrapping.bend is not None:
+    if obj.wrapping.bend is not None and light != "corrected":
         raise ValueError(
             f"light must be sampled for object {result.name}, which has a normal or bump map, got gathered"
         )

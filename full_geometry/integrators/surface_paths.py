@@ -92,15 +92,14 @@ class PathState:
 
 def trace_paths(
     scene: mi.Scene, objects: list[TranslucentObject], settings: Settings, sampler: mi.Sampler, ray: mi.Ray3f,
-    active: mi.Bool, scattered: bool = False, passes: bool = True,
+    active: mi.Bool, scattered: bool = False,
 ) -> tuple[tuple[mi.Spectrum, mi.Spectrum], mi.Bool, mi.Spectrum]:  # fmt: skip
     """Radiance along a camera ray in two parts for a replay, whether the ray hits anything, and unconnected light.
     The second part is light of orders 0 and 1 of the object that the ray meets first. What phase sampling alone has hit
-    is in both. `scattered` says whether the ray is one of many that a vertex may have sent, as for a path that goes on,
-    `passes` whether order 0 of the first object counts."""
+    is in both. `scattered` says whether the ray is one of many that a vertex may have sent, as for one that goes on."""
     # the first pass adds up; L of both its parts begins at 0
     context = RenderContext.of(scene, objects, settings, Primal())
-    L, radiance, hit = _loop(context, sampler, ray, (mi.Spectrum(0), mi.Spectrum(0)), (), active, scattered, passes)
+    L, radiance, hit = _loop(context, sampler, ray, (mi.Spectrum(0), mi.Spectrum(0)), (), active, scattered)
     return L, hit, radiance.unconnected
 
 
@@ -127,7 +126,7 @@ def replay_paths(
 
 def _loop(
     context: RenderContext, sampler: mi.Sampler, camera_ray: mi.Ray3f, L: tuple[mi.Spectrum, mi.Spectrum],
-    derivative: mi.Spectrum | tuple[()], active: mi.Bool, scattered: bool = False, passes: bool = True,
+    derivative: mi.Spectrum | tuple[()], active: mi.Bool, scattered: bool = False,
 ) -> tuple[tuple[mi.Spectrum, mi.Spectrum], PathRadiance, mi.Bool]:  # fmt: skip
     """All vertices of a path, in one or two passes: L, what is summed, and whether the camera ray hits anything.
     Where the first vertex is on an object with orders 0 and 1 and others, the path begins there a second time for
@@ -156,8 +155,7 @@ def _loop(
         vertex = Vertex(*met_surface(context, sampler, path.ray, si, active), path.ray, path.throughput,
                         first & path.second_pass, first & ~path.second_pass, path.scattered, active)  # fmt: skip
         following, radiance = sample_event(context, sampler, vertex, radiance)
-        counts = mi.Bool(passes) | ~vertex.one_event_only | following.scattered
-        throughput = dr.select(active, path.throughput * dr.select(counts, following.weight, 0), path.throughput)
+        throughput = dr.select(active, path.throughput * following.weight, path.throughput)
 
         # ---- Russian roulette: survive with q = min(throughput, 0.95), throughput /= q
         largest = dr.max(throughput)

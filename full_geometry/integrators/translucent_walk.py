@@ -26,7 +26,7 @@ from full_geometry.geometry.sensors import (
 from full_geometry.geometry.shape import SceneMark
 from full_geometry.geometry.snapshot import Snapshot, same_objects
 from full_geometry.integrators.bssrdf import Launch, is_independent, undisturbed
-from full_geometry.integrators.gathering import light_state
+from full_geometry.integrators.gathering import OutgoingLight, light_state
 from full_geometry.integrators.walk_paths import FirstExits, LightVisitor, PathTracer
 from full_geometry.objects.inclusions import check_sensors
 from full_geometry.objects.objects import KnowsUnit, check_size, places_of, translucent_shapes
@@ -109,7 +109,16 @@ def _class(variant: str) -> type:
             self._cells: tuple[Any, list] = (None, [])
             self._kept: tuple[Snapshot | None, UnscatteredLight | None] = (None, None)
             self._glints: tuple[Any, mi.UInt32 | None] = (None, None)
-            self.filling = 0.0
+            self.filling, self.outgoing, self.ends = 0.0, None, False
+
+        def media(self, scene: mi.Scene) -> WalkMedia:
+            """The objects of a scene, made ready once."""
+            self._prepared = _prepared(scene, self._prepared, self.mm_per_unit)
+            return self._prepared[-1]
+
+        def take(self, scene: mi.Scene, outgoing: OutgoingLight, light: UnscatteredLight | None) -> None:
+            """Light that leaves objects of a scene, by which walks end, and light inside; until something changes."""
+            self.outgoing, self._kept = outgoing, (light_state(scene), light and replace(light, scattered=None))
 
         def prepare(self, scene: mi.Scene, samples: int, seed: int = 0) -> None:
             """Precompute light once for all calls of `sample`, until objects or emitters change.
@@ -140,8 +149,7 @@ def _class(variant: str) -> type:
                 exits: whether walks have to leave, so that scattered light is not precomputed.
             """
             # ---- objects and inner lights, made once for a scene
-            self._prepared = _prepared(scene, self._prepared, self.mm_per_unit)
-            media, small = self._prepared[-1], SmallEmitters.of(scene)
+            media, small = self.media(scene), SmallEmitters.of(scene)
             inner = InnerLights.of(media, self.blur)
 
             # ---- light inside, precomputed by as many rays as the image has samples for
@@ -165,7 +173,7 @@ def _class(variant: str) -> type:
                 straight = find_straight_light(scene, media, self.max_depth == FOREVER, scored)
             visitor = LightVisitor(
                 scene=scene, media=media, small=small, connections=connections, directions=directions,
-                straight_light=straight, inner_lights=inner, blur=self.blur, unscattered=light,
+                straight_light=straight, inner_lights=inner, blur=self.blur, unscattered=light, outgoing=self.outgoing,
             )  # fmt: skip
             return PathTracer(visitor, self.max_depth, self.rr_depth, self.hidden, self.layers)
 
@@ -185,9 +193,9 @@ def _class(variant: str) -> type:
             reason = self._checked[1]
             if reason and self.light == "precomputed":
                 raise ValueError(f"light must be auto or sampled, got 'precomputed': {reason}")
-            # an even sky alone is met by every walk, and light inside would only add its noise
+            # an even sky alone is met by every walk, and light inside would only add its noise; not by walks that end
             uneven = any("Constant" not in emitter.class_name() for emitter in scene.emitters())
-            return not reason and (uneven or self.light == "precomputed")
+            return not reason and (uneven or self.light == "precomputed" or self.ends)
 
         def render(
             self, scene: mi.Scene, sensor: mi.Sensor | int = 0, seed: mi.UInt32 | int = 0, spp: int = 0,
@@ -199,7 +207,8 @@ def _class(variant: str) -> type:
             with interruptible(), undisturbed(), dr.suspend_grad():
                 seed = int(mi.UInt32(seed)[0])
                 samples = spp * int(dr.prod(sampled_size(sensor.film())))
-                tracer = self.tracer(scene, seed, samples, exits=keep is not None)
+                light = self._kept[1] if self.outgoing is not None else None
+                tracer = self.tracer(scene, seed, samples, light=light, exits=keep is not None)
                 _render(tracer, sensor, seed, spp, keep, False, self._glints_in(scene, tracer, sensor, spp))
                 return sensor.film().develop() if develop else None
 

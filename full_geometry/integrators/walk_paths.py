@@ -20,13 +20,14 @@ from full_geometry.geometry.instances import shapes_of
 from full_geometry.geometry.points import lane_numbers, lifted, opaque, sided
 from full_geometry.geometry.rounding import ray_from
 from full_geometry.geometry.sensors import past_emitters, shows_sky
+from full_geometry.integrators.gathering import OutgoingLight
 from full_geometry.objects.small_emitters import NARROW, WIDE, SmallEmitters
 from full_geometry.precomputed.forward_scattering import ForwardRun
 from full_geometry.precomputed.scattered_light import FEW, ONWARD
 from full_geometry.precomputed.unscattered_light import UnscatteredLight
 from full_geometry.walk.emission import emission, emitter_pdf, mis_weight, next_event, survival
 from full_geometry.walk.emitter_connections import Departure, EmitterDirections, InnerLights, SubpathConnections
-from full_geometry.walk.media import WalkMedia, WalkMedium, interaction_of, ray_of
+from full_geometry.walk.media import Coefficients, WalkMedia, WalkMedium, interaction_of, ray_of
 from full_geometry.walk.random_walk import (
     OUTSIDE,
     Crossing,
@@ -37,6 +38,7 @@ from full_geometry.walk.random_walk import (
     draw,
     draw_channel,
     eval_phase,
+    pick,
     sample_bsdf,
     start_walk,
 )
@@ -44,6 +46,7 @@ from full_geometry.walk.scores import PathScores, Score, ScoreVisitor, Stay, Sta
 from full_geometry.walk.straight_light import StraightLight
 from halfspace_sss.tracing.walk import generator, pass_seed
 
+ALONG = 3  # events that are looked up along a flight, a multiple of the channels
 MIRRORS = 2  # of objects, one in the other, in which the first surface of a path finds emission
 LEAST_SEEN = 1e-3  # transmittance, below which emission behind an object is left to chance
 
@@ -69,6 +72,7 @@ class LightRecord:
     known: mi.Bool  # light that comes by objects alone has been found precomputed
     slopes: Score | tuple[()] = ()  # where derivatives are asked for, see `walk.scores`
     run: ForwardRun | tuple[()] = ()  # where precomputed light has met forward events
+    shallow: mi.Bool | tuple[()] = ()  # one event at most since the path went in, where deep light is told apart
 
 
 class Seen(NamedTuple):
@@ -137,6 +141,8 @@ class LightVisitor:
         inner_lights: delta lights inside objects, if there are any.
         blur: scale of the cones over which delta lights outside are spread; 0 leaves their light out.
         unscattered: light that events find precomputed, in place of connections, directions and straight light.
+        outgoing: deep light of objects, of paths inside that begin with two scattering events, known where they go in.
+        deep: whether that light alone counts, of the object that a path meets first.
     """
 
     scene: mi.Scene
@@ -148,8 +154,70 @@ class LightVisitor:
     inner_lights: InnerLights | None = None
     blur: float = 1.0
     unscattered: UnscatteredLight | None = None
+    outgoing: OutgoingLight | None = None
+    deep: bool = False
+
+    @property
+    def splits(self) -> bool:
+        """Whether deep light is apart from all other."""
+        return self.deep or self.outgoing is not None
 
     def event(self, walk: Walk, record: LightRecord, event: Event) -> tuple[Walk, LightRecord]:
+        if not self.splits:
+            return self._lit_event(walk, record, event)[:2]
+        # ---- unscattered light that is looked up on the flight is no deep light, all else is; other walks end
+        L, shallow = record.L, record.shallow
+        if self.ahead:
+            walk, record, _ = self._lit_event(walk, record, event)
+            record = replace(record, L=dr.select(shallow, L, record.L), shallow=mi.Bool(False))
+            return walk if self.deep else replace(walk, alive=walk.alive & ~shallow), record
+
+        # ---- deep light begins at the second event, and by connections at the first; other walks end at the second
+        L, second = record.L, record.shallow & (walk.order > 0)
+        record = replace(record, shallow=record.shallow & ~second)
+        walk, record, connected = self._lit_event(walk, record, event)
+        if self.deep:
+            return walk, replace(record, L=dr.select(record.shallow, L + connected, record.L))
+        return replace(walk, alive=walk.alive & ~second), replace(record, L=dr.select(second, L, record.L))
+
+    @property
+    def ahead(self) -> bool:
+        """Whether unscattered light of first events is looked up along flights."""
+        return self.splits and self.unscattered is not None and not self.media.varies
+
+    def flight(self, walk: Walk, record: LightRecord, m: Coefficients, length: mi.Float) -> LightRecord:
+        """The record with the light of first events along a flight: Σ w sigma_s T J / density."""
+        n, looks = len(m.sigma_t), record.shallow & (walk.order == 0)
+        ends, shift = 1 - dr.exp(-m.sigma_t * length), walk.rng.next_float32()
+
+        def look(j: mi.UInt32, light: mi.Spectrum) -> tuple[mi.UInt32, mi.Spectrum]:
+            # s = -ln(1 - u (1 - exp(-sigma_t length))) / sigma_t, for the channels in turn, u stratified
+            c, u = j % n, shift + mi.Float(j) / ALONG
+            u = (u - dr.floor(u)) * pick(ends, c)
+            s = dr.minimum(-dr.log(1 - dr.minimum(u, 1 - 1e-7)) / pick(m.sigma_t, c), length)
+            T = dr.exp(-m.sigma_t * s)
+            density = dr.sum(m.sigma_t * T / dr.maximum(ends, 1e-30)) / n
+            event = Event(walk.o + walk.d * s, walk.d, walk.object, m, walk.medium)
+            J = self.unscattered.light(self.media, event)[0]
+            return j + 1, light + m.sigma_s * T * J / dr.maximum(density, 1e-30)
+
+        def along(light: mi.Spectrum) -> tuple[mi.Spectrum]:
+            state = (mi.UInt32(0), light)
+            return (dr.while_loop(state, lambda j, _: j < ALONG, look, label="events")[1],)
+
+        (light,) = dr.if_stmt((mi.Spectrum(0),), looks, along, _same_state, label="along a flight")
+        return replace(record, L=record.L + walk.weight * light / ALONG)
+
+    def _left_early(self, walk: Walk, record: LightRecord, L: mi.Spectrum, moved: mi.Bool) -> tuple[Walk, LightRecord]:
+        """The walk and its record; where it has moved on before deep light began, L stays in that."""
+        early = record.shallow & moved
+        record = replace(record, shallow=record.shallow & ~early)
+        if not self.deep:
+            return walk, record
+        return replace(walk, alive=walk.alive & ~early), replace(record, L=dr.select(early, L, record.L))
+
+    def _lit_event(self, walk: Walk, record: LightRecord, event: Event) -> tuple[Walk, LightRecord, mi.Spectrum]:
+        """The walk and its record with light of an event; the last is that of connections."""
         # ---- delta lights inside: L += throughput p(cos) E
         record = replace(record, scattered=mi.Bool(True))
         if self.inner_lights is not None:
@@ -161,13 +229,14 @@ class LightVisitor:
         if self.unscattered is not None:
             counts = self.media.counts(walk.object, walk.order + 1)
             if self.unscattered.scattered is not None:
-                return self._all_light(walk, record, event)
+                return *self._all_light(walk, record, event), mi.Spectrum(0)
             L = walk.weight * self.unscattered.light(self.media, event)[0]
             if self.forward:
                 share = dr.select(record.precomputed & (walk.order > 0), record.run.onward(event.along).share, 1)
                 run = ForwardRun(share, mi.Vector3f(event.along), mi.Spectrum(event.m.g), mi.Bool(True))
                 record = replace(record, run=run)
-            return walk, replace(record, L=record.L + dr.select(counts, L, 0), precomputed=mi.Bool(True))
+            record = replace(record, L=record.L + dr.select(counts, L, 0), precomputed=mi.Bool(True))
+            return walk, record, mi.Spectrum(0)
 
         # ---- emitters behind boundaries of index 1: L += throughput p L_e T / p_e  p_e / (p_e + p)
         if self.straight_light is not None:
@@ -176,22 +245,25 @@ class LightVisitor:
             record = replace(record, sighted=sees, departure=departure, delta=record.delta | sees)
             walk, record, _ = dr.if_stmt((walk, record, event), sees, self._see, _same_state, label="emitters")
         if self.connections is None:
-            return walk, record
+            return walk, record, mi.Spectrum(0)
 
         # ---- connections with light subpaths; where the edge to the last event was straight, they find the rest of it
         smooth = self.media.connects(walk.object)
         edge = record.straight & smooth & (walk.order > 0)  # this event ends one
         connected = record.connected | edge
         record = replace(record, connected=connected, pivot=dr.select(edge, event.p, record.pivot))
-        connects = smooth & (walk.order + 2 <= self.media.row("most", walk.object))
+        connects, L = smooth & (walk.order + 2 <= self.media.row("most", walk.object)), record.L
+        if self.outgoing is not None:
+            connects &= ~record.shallow
         walk, record, _ = dr.if_stmt((walk, record, event), connects, self._connect, _same_state, label="connections")
+        met = record.L - L
 
         # ---- directions to emitters, where no connection finds their light, with MIS weights against phase sampling
         directed = smooth & ~connected & self.media.counts(walk.object, walk.order + 1)
         record = replace(record, straight=mi.Bool(True), directed=directed)
         walk, record, _ = dr.if_stmt((walk, record, event), directed, self._direct, _same_state, label="directions")
         departure = Departure(event.p, event.along, record.departure.ahead, walk.object)
-        return walk, replace(record, departure=departure)
+        return walk, replace(record, departure=departure), met
 
     def _all_light(self, walk: Walk, record: LightRecord, event: Event) -> tuple[Walk, LightRecord]:
         """Precomputed light of an event: unscattered, and of a few events on all, with which the walk ends."""
@@ -228,6 +300,7 @@ class LightVisitor:
         if self.forward:
             record = replace(record, run=record.run.onward(walk.d))
         left = self.left(record)
+        active = active & ~record.shallow if self.deep else active
         light = self.sampled_emitter(walk, si, self.media.boundary(walk.object), active & (dr.max(dr.abs(left)) > 0))
         return walk, replace(record, L=record.L + left * light)
 
@@ -243,7 +316,7 @@ class LightVisitor:
 
     def left(self, record: LightRecord) -> mi.Spectrum:
         """The share of the emission met next that is not precomputed."""
-        if self.unscattered is None:
+        if self.unscattered is None and self.outgoing is None:
             return mi.Spectrum(1)
         share = record.run.share if self.forward else mi.Spectrum(0)
         return dr.select(record.precomputed | record.known, share, mi.Spectrum(1))
@@ -260,9 +333,21 @@ class LightVisitor:
             lit = (k < 0) & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
             d, E = self.inner_lights.light(walk.object, si, walk.rng, lit, walk.medium)
             L = L + dr.select(lit, walk.weight * bsdf.eval(mi.BSDFContext(), si, si.to_local(d), lit) * E, 0)
-        return walk, replace(record, L=L)
+        before, record = record.L, replace(record, L=L)
+        return self._left_early(walk, record, before, k != walk.object) if self.splits else (walk, record)
 
     def crossing(self, walk: Walk, record: LightRecord, crossing: Crossing) -> tuple[Walk, LightRecord]:
+        L = record.L
+        walk, record = self._lit_crossing(walk, record, crossing)
+        if not self.splits:
+            return walk, record
+        moved = crossing.leaves
+        if self.media.inner is not None:
+            moved |= self.media.index_of(crossing.si) != walk.object
+        return self._left_early(walk, record, L, moved)
+
+    def _lit_crossing(self, walk: Walk, record: LightRecord, crossing: Crossing) -> tuple[Walk, LightRecord]:
+        """The walk and its record behind a boundary, with what light there is at it."""
         # ---- the last vertex is the boundary, with the density of the direction that leaves it
         before = record
         record = replace(record, previous=crossing.si.p, pdf=crossing.pdf, delta=crossing.delta)
@@ -330,17 +415,17 @@ class LightVisitor:
         return self.unscattered is not None and not (self.media.varies or self.media.carried)
 
     def seen_emitters(
-        self, walk: Walk, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32, active: mi.Bool, through: mi.Bool
+        self, walk: Walk, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32, active: mi.Bool
     ) -> tuple[Seen, Seen]:
         """What object k mirrors, and what is seen through it; added whatever is chosen, it must not count again.
-        Only where light inside is precomputed: beside light that is met by chance, of an even sky above all, the choice
-        between both sides of the boundary has less noise. `active`: whether emitters are looked for. `through`: the
-        same behind the object; where a path has scattered, the cones of delta lights are met there."""
+        Only where light inside or leaving is known: beside light that is met by chance, of an even sky above all, the
+        choice between both sides of the boundary has less noise. `active`: whether emitters are looked for; where a
+        path has scattered, cones of delta lights are met instead."""
         none = Seen(mi.Spectrum(0), mi.Bool(False), mi.Spectrum(1))
-        if self.unscattered is None:
+        if self.unscattered is None and self.outgoing is None:
             return none, none
         smooth = ~self.media.row("rough", k)
-        behind = self.emitter_behind(walk, si, k, smooth & through) if self.sees_through else none
+        behind = self.emitter_behind(walk, si, k, smooth & active) if self.sees_through else none
         return self.mirrored_emitter(walk, si, bsdf, smooth & active), behind
 
     def mirrored_emitter(self, walk: Walk, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool) -> Seen:
@@ -459,7 +544,7 @@ def _plus(record: LightRecord, walk: Walk, light: mi.Spectrum, slopes: Score | t
     return replace(record, L=record.L + walk.weight * light, slopes=slopes)
 
 
-def start_record(lanes: int, scored: bool = False, forward: bool = False) -> LightRecord:
+def start_record(lanes: int, scored: bool = False, forward: bool = False, splits: bool = False) -> LightRecord:
     """The record of a path that begins at the camera."""
 
     def full(kind: type, value: float | bool | int) -> Any:
@@ -473,7 +558,7 @@ def start_record(lanes: int, scored: bool = False, forward: bool = False) -> Lig
         departure=Departure(mi.Point3f(point), along, mi.Vector3f(along), full(mi.Int32, 0)),
         sighted=full(mi.Bool, False), scattered=full(mi.Bool, False),
         precomputed=full(mi.Bool, False), known=full(mi.Bool, False), slopes=Score.sums(lanes) if scored else (),
-        run=ForwardRun.none(lanes) if forward else (),
+        run=ForwardRun.none(lanes) if forward else (), shallow=full(mi.Bool, False) if splits else (),
     )  # fmt: skip
 
 
@@ -490,8 +575,6 @@ class PathTracer:
         rr_depth: vertices outside after which roulette may end a path.
         hide_emitters: whether the camera sees no emitters.
         layers: whether emission that the camera sees, at once or in the mirror of an object, is also told apart.
-        begins_inside: whether the object that a path meets first does not reflect it, but lets it in or ends it.
-        passes: whether light that passes the first object unscattered counts.
         apart: by the number of a ray, whether light is without its `seen_emission`.
     """
 
@@ -500,14 +583,7 @@ class PathTracer:
     rr_depth: int
     hide_emitters: bool
     layers: bool = False
-    begins_inside: bool = False
-    passes: bool = True
     apart: mi.Bool | None = None
-
-    @property
-    def begins_at(self) -> mi.UInt32:
-        """The depth of the surface that does not reflect; 0, which none has, where all may."""
-        return mi.UInt32(1 if self.begins_inside else 0)
 
     def trace(
         self,
@@ -527,13 +603,14 @@ class PathTracer:
         dr.eval(L, hit, emission)
         media, visitor = self.visitor.media, FirstExitVisitor(self.visitor, exits) if exits else self.visitor
         scorer = ScoreVisitor(self.visitor, media, scores) if scores else None
-        walker = Walker(media, scorer or visitor)
+        ahead = self.visitor.flight if self.visitor.ahead and not self.visitor.deep else None
+        walker = Walker(media, scorer or visitor, ahead=ahead)
         total, step = (dr.opaque(mi.UInt32, v) for v in (n, lanes))  # kernels then serve images of any size
 
         # ---- the parts of an iteration
 
         def begin(index: mi.UInt32, rng: mi.PCG32) -> CameraPath:
-            path = _begin(rays, total, index, rng, media, bool(scores), self.visitor.forward)
+            path = _begin(rays, total, index, rng, self.visitor, bool(scores))
             if self.visitor.sees_through and exits is None:  # of all orders, the lowest too
                 path.walk.kept = dr.full(mi.Spectrum, 1, dr.width(index))
             return replace(path, emission=dr.zeros(mi.Spectrum, dr.width(index))) if self.layers else path
@@ -583,8 +660,6 @@ class PathTracer:
     def seen_emission(self, rays: mi.Ray3f) -> mi.Spectrum:
         """Emission that rays see in the mirror of the object that they meet first, and behind it: a part of `trace`."""
         walk = start_walk(rays.o, rays.d, generator(mi, dr.width(rays), pass_seed(0)))
-        if self.begins_inside:
-            return dr.zeros(mi.Spectrum, dr.width(rays))
         return self._mirrored(walk, dr.full(mi.Bool, True, dr.width(rays)), MIRRORS)
 
     def mirrored(self, rays: mi.Ray3f) -> tuple[mi.Point3f, mi.Vector3f, mi.Bool]:
@@ -593,7 +668,7 @@ class PathTracer:
         si = media.instance_scene.intersect(self.visitor.scene, rays, mi.RayFlags.All)
         k = media.index_of(si, si.is_valid())
         near = dr.maximum(k, 0)
-        found = (k >= 0) & media.row("reflects", near) & ~media.row("rough", near) & (not self.begins_inside)
+        found = (k >= 0) & media.row("reflects", near) & ~media.row("rough", near)
         walk, found = _along_mirror(media, walk, media.seen(si, k, rays.d), media.boundary_pointer(near), found)
         return walk.o, walk.d, found
 
@@ -609,7 +684,7 @@ class PathTracer:
             si = media.seen(si, k, walk.d)
             active = active & (k >= 0) & media.row("reflects", near)
             boundary = media.boundary_pointer(near)
-            mirrored, behind = self.visitor.seen_emitters(walk, si, boundary, near, active, active)
+            mirrored, behind = self.visitor.seen_emitters(walk, si, boundary, near, active)
             L = L + mirrored.light + behind.light
             if level + 1 < levels:
                 walk, active = _along_mirror(media, walk, si, boundary, mirrored.found)
@@ -633,9 +708,6 @@ class PathTracer:
         # ---- the surface, unless the path is as deep as it may get
         depth = p.depth + 1
         alive = si.is_valid() & (depth < mi.UInt32(self.max_depth))
-        if not self.passes:
-            unscattered = (p.depth == 1) & (p.walk.order == 0)
-            light, alive = replace(light, L=dr.select(unscattered, p.light.L, L)), alive & ~unscattered
         walk, skips = replace(p.walk, alive=alive), mi.Bool(False)
         if len(walk.within):
             walk, skips = self._skip(walk, si)
@@ -669,21 +741,21 @@ class PathTracer:
         """A surface met from outside: next-event estimation, BSDF sampling, Russian roulette, the way on or in."""
         # ---- what masks leave: the boundary of object k or another BSDF
         walk, media, rng = p.walk, self.visitor.media, p.walk.rng
-        k, bsdf = media.draw(si, walk.d, rng)
+        k, bsdf, si, mute = self._drawn(p, si)
         translucent, near, light = k >= 0, dr.maximum(k, 0), replace(p.light, known=p.light.known & (k >= 0))
-        si = media.seen(si, k, walk.d)
-        mute = mi.Bool(False)
-        if media.objects:
-            bsdf = dr.select(translucent, media.boundary_pointer(near), bsdf)
-            mute = translucent & ((p.depth == self.begins_at) | ~media.row("reflects", near))
         lit = ~(mute | light.known)
-        behind = None if media.inner is None else self._behind(walk, si, bsdf, translucent)
+        behind, outer = None if media.inner is None else self._behind(walk, si, bsdf, translucent), translucent
         if behind is not None:
-            bsdf, lit = behind.bsdf, lit & ~behind.unlit
+            bsdf, lit, outer = behind.bsdf, lit & ~behind.unlit, translucent | behind.member
 
         # ---- next-event estimation: L += throughput f cos L_e / p_e  p_e / (p_e + p_f)
-        outer = translucent if behind is None else translucent | behind.member
         L = light.L + self.visitor.sampled_emitter(walk, si, bsdf, lit, outer)
+
+        # ---- deep light that is known: L += throughput a C.Y
+        held = translucent & (p.depth == 1)
+        if self.visitor.outgoing is not None:
+            held, deep = self.visitor.outgoing.radiance(si, near, -walk.d, _in_air(translucent, behind))
+            L = L + walk.weight * deep
 
         # ---- emitters in the mirror of a smooth boundary, and behind it: F L_e, (1 - F) T (1 - F') L_e
         mirrored, seen, L, p = self._seen(L, p, si, bsdf, near, translucent & lit)
@@ -696,10 +768,8 @@ class PathTracer:
         weight, scale = walk.weight * value * mirrored.kept, walk.scale * dr.square(bs.eta)
 
         # ---- Russian roulette: survive with q = min(size, 0.95), throughput /= q
-        size = dr.max(weight) * scale
-        survive = survival(size, p.depth, self.rr_depth)
-        weight = weight / dr.maximum(survive, 1e-30)
-        alive = (bs.pdf > 0) & (size > 0) & (rng.next_float32() < survive) & ~(mute & ~enters)
+        survive = survival(dr.max(weight) * scale, p.depth, self.rr_depth)
+        alive = (bs.pdf > 0) & (dr.max(weight) > 0) & (rng.next_float32() < survive) & ~(mute & ~enters)
 
         # ---- the way on, or into an object
         channel, density = self._channel(p, near, rng.next_float32())
@@ -711,7 +781,8 @@ class PathTracer:
             new = alive & enters
             walk = replace(walk, medium=dr.select(new, media.fetch(dr.maximum(k, 0), si, new), walk.medium))
         walk = replace(walk, o=o, d=d, off=off, alive=alive, order=dr.select(enters, 0, walk.order), channel=channel,
-                       density=density, object=dr.select(alive & enters, k, OUTSIDE), weight=weight, scale=scale,
+                       density=density, object=dr.select(alive & enters, k, OUTSIDE), scale=scale,
+                       weight=weight / dr.maximum(survive, 1e-30),
                        kept=dr.select(enters, seen.kept, 1) if len(walk.kept) else ())  # fmt: skip
 
         # ---- the last vertex for the MIS weight of emission; index 1 keeps the event
@@ -723,11 +794,28 @@ class PathTracer:
         light = replace(light, L=L, previous=dr.select(again, light.previous, si.p), sighted=again,
                         pdf=dr.select(again, light.pdf, bs.pdf), delta=delta & ~again, scattered=scattered,
                         precomputed=dr.select(enters, seen.found, mirrored.found),
-                        run=light.run and light.run.ended())  # fmt: skip
+                        run=light.run and light.run.ended(),
+                        shallow=held & enters if self.visitor.splits else ())  # fmt: skip
         if behind is not None:
             L = L + self.visitor.spread_inner_lights(walk, scattered & enters)
             light = replace(light, delta=~again & (delta | enters | through | behind.unlit), L=L)
         return replace(p, walk=walk, light=light, mirrored=p.mirrored & mirrored.found & ~enters)
+
+    def _drawn(
+        self, p: CameraPath, si: mi.SurfaceInteraction3f
+    ) -> tuple[mi.Int32, mi.BSDFPtr, mi.SurfaceInteraction3f, mi.Bool]:
+        """The number of the object that is met, or -1, the BSDF, the point as seen, and whether it must not reflect."""
+        media, deep = self.visitor.media, self.visitor.deep
+        k, bsdf = media.draw(si, p.walk.d, p.walk.rng)
+        if deep and media.wrappings:
+            k = dr.select(p.depth == 1, media.index_of(si), k)
+        mute = mi.Bool(False)
+        if media.objects:
+            near = dr.maximum(k, 0)
+            bsdf = dr.select(k >= 0, media.boundary_pointer(near), bsdf)
+            mute = (k >= 0) & ~media.row("reflects", near)
+            mute |= (k >= 0) & (p.depth == 1) if deep else False
+        return k, bsdf, media.seen(si, k, p.walk.d), mute
 
     def _channel(self, p: CameraPath, k: mi.Int32, u: mi.Float) -> tuple[mi.UInt32, mi.Spectrum]:
         """The channel by which a path draws, once at its first surface, and its q from there."""
@@ -746,10 +834,7 @@ class PathTracer:
         # emission that rays find lacks delta lights: where a path has scattered, it meets their cones instead
         small = self.visitor.small
         active = active & ~p.light.scattered if small is not None and small.n_delta else active
-        through = active
-        if not self.passes:
-            through = through & (p.depth > 1)
-        mirrored, behind = self.visitor.seen_emitters(p.walk, si, bsdf, k, active, through)
+        mirrored, behind = self.visitor.seen_emitters(p.walk, si, bsdf, k, active)
         light, first = mirrored.light + behind.light, p.depth == 1
 
         # ---- the first surface finds what mirrors show in its mirror, so that they must not
@@ -781,6 +866,10 @@ def _along_mirror(
     return replace(walk, o=o, d=d, weight=walk.weight * value), active & (bs.pdf > 0)
 
 
+def _in_air(translucent: mi.Bool, behind: Behind | None) -> mi.Bool:
+    return translucent if behind is None else translucent & ~behind.unlit
+
+
 def _same(p: CameraPath) -> CameraPath:
     return p
 
@@ -790,11 +879,11 @@ def _begin(
     total: mi.UInt32,
     index: mi.UInt32,
     rng: mi.PCG32,
-    media: WalkMedia,
+    visitor: LightVisitor,
     scored: bool = False,
-    forward: bool = False,
 ) -> CameraPath:
     """A path of the ray with this number, outside of all objects."""
+    media = visitor.media
     lanes, known = dr.width(index), index < total
     o, d = dr.gather(mi.Point3f, rays.o, index, known), dr.gather(mi.Vector3f, rays.d, index, known)
     no, first = dr.full(mi.Bool, False, lanes), dr.full(mi.UInt32, 0, lanes)
@@ -804,7 +893,7 @@ def _begin(
         walk.within = dr.full(mi.UInt32, 0, lanes)
     stay = Stay.none(lanes, media.textured) if scored else ()
     yes = dr.full(mi.Bool, True, lanes)
-    return CameraPath(index, walk, start_record(lanes, scored, forward), no, first, yes, stay)
+    return CameraPath(index, walk, start_record(lanes, scored, visitor.forward, visitor.splits), no, first, yes, stay)
 
 
 # ---- First exits of paths from the camera ------------------------------------------------------------------------

@@ -150,12 +150,13 @@ class Incident:
         return cls(*(np.mean([getattr(part, name) for part in parts], axis=0) for name in ("mean", "moment")))
 
 
-def bent(w: mi.Vector3f, n_out: mi.Normal3f, eta: float) -> mi.Vector3f:
+def bent(w: mi.Vector3f, n_out: mi.Normal3f, eta: float | mi.Float) -> mi.Vector3f:
     """A direction outside as the boundary bends it, turned back to the outer side."""
     # Snell: mu_t² = 1 - (1 - mu²) / eta², and 0 where all is reflected (eta < 1), of weight F_t = 0
     mu = dr.dot(w, n_out)
-    mu_t = dr.safe_sqrt(1 - (1 - dr.minimum(dr.square(mu), 1)) * opaque(eta**-2))
-    return mi.Vector3f((w - mu * n_out) * opaque(1 / eta) + mu_t * n_out)
+    ratio, squared = (1 / eta, dr.rcp(eta * eta)) if isinstance(eta, mi.Float) else (opaque(1 / eta), opaque(eta**-2))
+    mu_t = dr.safe_sqrt(1 - (1 - dr.minimum(dr.square(mu), 1)) * squared)
+    return mi.Vector3f((w - mu * n_out) * ratio + mu_t * n_out)
 
 
 class Hemispheres(NamedTuple):
@@ -359,17 +360,17 @@ class TransportMatrix:
         return smooth
 
 
-def count_of(obj: TranslucentObject) -> int:
-    """How many points an object gets: so many that their distance is half a transport mean free path."""
+def count_of(obj: TranslucentObject, area: float) -> int:
+    """How many points an object of this area gets: their distance is half a transport mean free path."""
     # A (2 sigma_t')²
     sigma = np.mean([float(m.sigma_t_prime) for m in obj.media])
-    return int(np.clip(obj.geometry.area * (PER_LENGTH * sigma) ** 2, FEWEST, MOST))
+    return int(np.clip(area * (PER_LENGTH * sigma) ** 2, FEWEST, MOST))
 
 
 def transport_matrix(obj: TranslucentObject, share: float = 1.0, seed: int = SEED) -> TransportMatrix:
     """The transport matrix of an object by its model, with a share of all entries, which its proposals draw."""
     # ---- entries of each point with S mu_i over their density: by distance, or by the proposals of dense objects
-    points = SurfacePoints.of(obj.geometry, count_of(obj))
+    points = SurfacePoints.of(obj.geometry, count_of(obj, obj.geometry.area))
     n = max(int(share * max(SAMPLES / len(points), FEWEST_ENTRIES)), FEWEST_OF_PART)
     if places_resolve(obj):
         result = stratified(obj, points, n, seed)

@@ -88,6 +88,7 @@ WALKS = Capabilities(  # what the integrator `translucent_walk` takes, which nee
     orders="total", straight=True, textures=True, spectra=True, inclusions=True, varying="exact", stretched=True,
     normal_maps=True, derivatives="all",
 )  # fmt: skip
+CORRECTED = replace(WALKS, spectra=False, derivatives="", gathered=True)  # what corrected light takes, of any model
 _others = once(lambda: offers(TRANSPORTS))
 
 

@@ -28,7 +28,7 @@ from full_geometry.objects.objects import (
 from full_geometry.settings import AUTO, AUTOMATIC, GATHERED_LIGHTS, NO_OBJECT, Capabilities, Choices, Settings
 from full_geometry.surface.medium_derivatives import DifferentiableTransport, MediumDerivatives
 from full_geometry.surface.sheets import check_sheets
-from full_geometry.surface.translucent import MediumSpec, check_boundary, is_smooth_boundary
+from full_geometry.surface.translucent import MediumSpec, check_boundary
 from full_geometry.surface.varying import equivalent, warn_of_means
 from full_geometry.surface.wrapped import surface_of
 from full_geometry.transport.half_space import check_turns, half_space_model
@@ -96,14 +96,13 @@ def _make_object(geometry: Geometry, spec: MediumSpec, settings: Settings) -> Tr
         _check_takes(geometry, spec, single_only)
     capabilities = lookup(spec.model).capabilities
     derivatives = MediumDerivatives(obj.surface, settings.mm_per_unit, spec.model, capabilities.derivatives)
-    exact = corrected and is_smooth_boundary(obj.surface.boundary)  # a rough one blurs what passes unscattered
-    if spec.orders == "total" and not (single_only or capabilities.straight or exact):
+    if spec.orders == "total" and not (single_only or capabilities.straight or corrected):
         check_turns(geometry, media, spec.model)
     none = ObjectModel(None, None)
     transport, proposals, entries = none if single_only else _model_of(obj, spec, settings)
     if transport and transport.orders == "total" and spec.orders == "multiple":
         raise ValueError(f"orders must be total for the model {spec.model!r}, which contains them all, got multiple")
-    low_orders = _low_orders(spec, transport, exact)
+    low_orders = _low_orders(spec, transport, corrected)
     if transport is not None and capabilities.derivatives and obj.textured is None and obj.spectral is None:
         transport = DifferentiableTransport(transport, derivatives)
     entries = entries if settings.entries == AUTOMATIC else settings.entries

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from types import ModuleType
 from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -257,12 +258,16 @@ def per_channel(rows: list[float | np.ndarray], scale: float) -> list[mi.Float]:
     return [mi.Float(values[:, c].tolist()) for c in range(n)] if len(rows) else []
 
 
+def sent_back(lib: ModuleType, albedo: Number, g: Number) -> Number:
+    """About the light that a half-space sends back, for NumPy or Dr.Jit.
+    (1 - s) (1 - 0.139 s) / (1 + 1.17 s), s² = (1 - a) / (1 - a g) for the albedo a (van de Hulst 1980)."""
+    s = lib.sqrt((1 - albedo) / lib.maximum(1 - albedo * g, 1e-6))
+    return lib.maximum((1 - s) * (1 - 0.139 * s) / (1 + 1.17 * s), 1e-6)
+
+
 def _shares(medium: Medium) -> np.ndarray:
-    """Probability of each channel of a walk: a part evenly, the rest by the light that a half-space sends back.
-    About (1 - s) (1 - 0.139 s) / (1 + 1.17 s) of it, s² = (1 - a) / (1 - a g) for the albedo a (van de Hulst 1980)."""
-    albedo = np.atleast_1d(medium.albedo).astype(float)
-    s = np.sqrt((1 - albedo) / np.maximum(1 - albedo * medium.g, 1e-6))
-    R = np.maximum((1 - s) * (1 - 0.139 * s) / (1 + 1.17 * s), 1e-6)
+    """Probability of each channel of a walk: a part evenly, the rest by the light that a half-space sends back."""
+    R = sent_back(np, np.atleast_1d(medium.albedo).astype(float), medium.g)
     return EVENLY / len(R) + (1 - EVENLY) * R / R.sum()
 
 
@@ -287,6 +292,7 @@ def _eval(volumes: list[mi.Volume | None], k: mi.Int32, p: mi.Point3f) -> mi.Spe
     return value
 
 
+Number = "mi.Spectrum | np.ndarray"
 _FEWEST = {"total": 0, "multiple": 2, "single": 1}
 _MOST = {"total": 2**31 - 1, "multiple": 2**31 - 1, "single": 1}
 

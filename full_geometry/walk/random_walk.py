@@ -6,6 +6,7 @@ Dr.Jit, which goes through the loop beside the walk: light for images, exits for
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol, TypeVar
 
@@ -227,11 +228,12 @@ class StartVisitor(Visitor, Protocol):
 class Walker:
     """A walk inside translucent objects.
     `media`: the objects. `visitor`: what is recorded. `roulette_from`: scattering events from which on roulette may end
-    a walk."""
+    a walk. `ahead`: the record with what is recorded along a flight to the boundary, by its coefficients and length."""
 
     media: WalkMedia
     visitor: Visitor
     roulette_from: int = 1
+    ahead: Callable | None = None
 
     def step(self, walk: Walk, record: Record) -> tuple[Walk, Record]:
         """A free flight, and the scattering event, the null collision or the boundary at its end."""
@@ -243,7 +245,11 @@ class Walker:
             draw = draw * pick(walk.kept, walk.channel)
         t = free_path(m, walk.channel, draw)
         ray, p = walk.ray(t), mi.Point3f(walk.o + walk.d * t)
+        if self.ahead is not None:
+            ray.maxt = dr.largest(mi.Float)
         hit = (media.inner or media).scene.ray_intersect_preliminary(ray, coherent=False)
+        if self.ahead is not None:
+            record = self.ahead(walk, record, m, walk.reach(hit.t))
 
         # ---- w_c = f_c / mean_k p_k of the flight, by the coefficients at its end
         if media.varies:
@@ -362,7 +368,7 @@ class Walker:
         if inner.priorities is not None:
             walk = replace(walk, within=dr.select(of.member & (through | passes), of.within, walk.within))
         to, d, value = dr.select(through, to, k), dr.select(passes, ray.d, d), dr.select(passes, 1, value)
-        alive = si.is_valid() & (passes | ((bs.pdf > 0) & (dr.max(value) > 0)))
+        alive = walk.alive & si.is_valid() & (passes | ((bs.pdf > 0) & (dr.max(value) > 0)))
 
         # ---- the way on, with the medium of what it enters; such paths count as a transport's from now on
         o, off = media.depart(si, d, to >= 0)
