@@ -47,7 +47,7 @@ class BSSRDF(abc.ABC):
     A model gives `G`, the BSSRDF without its two Fresnel transmittances in mean free paths; this class adds
     what all share: S = sigma_t² T_12(mu_i) T_21(mu_o) G(sigma_t r, ...), checks, channels and sampling.
 
-    Class attributes of a model:
+    Attributes:
         name: its name in the registry.
         orders: "multiple" (two or more scattering events) or "total" (single scattering included).
         reciprocal: whether S(x_i, w_i; x_o, w_o) = S(x_o, w_o; x_i, w_i) holds exactly.
