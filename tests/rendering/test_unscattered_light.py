@@ -296,6 +296,16 @@ def test_light_of_a_window_has_a_fraction_of_the_noise_of_sampled_light() -> Non
     assert noise[0] < 0.05 * noise[1]  # .06 if walks went on beyond their third event
 
 
+def test_the_mirror_image_of_a_lamp_that_fills_a_thirtieth_of_a_pixel_is_found() -> None:
+    """F L times the area of the image in a mirror of focal length R / 2, in pixels; R = 5, the lamp 29 away."""
+    scene = _scene("precomputed", MEDIUM, pixels=64, lamp=_lamp(0.2))
+    image = np.array(mi.render(scene, spp=16, seed=1)).sum(axis=2)
+    row, column = np.unravel_index(image.argmax(), image.shape)
+    glint = image[row - 1 : row + 2, column - 1 : column + 2].sum() - 9 * np.median(image[image > 0])
+    pixel = 2 * np.tan(np.radians(8)) * 38 / 64
+    assert glint == pytest.approx(3 * 20 * (0.4 / 2.4) ** 2 * (0.4 * 2.5 / (29 + 2.5) / pixel) ** 2, rel=0.15)
+
+
 def test_the_same_seed_gives_the_same_picture_and_another_seed_other_light() -> None:
     scene = _scene("precomputed", MEDIUM, lamp=_lamp())
     a, b, c = (np.array(mi.render(scene, spp=4, seed=seed)) for seed in (3, 3, 4))
