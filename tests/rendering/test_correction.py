@@ -273,6 +273,7 @@ def test_it_takes_what_walks_take_and_has_their_means_within_1_percent(things: A
         found.append(_image(scene, 128, part).reshape(2, 8, 2, 8, 3).mean(axis=(1, 3)))
     for of in (lambda x: np.array(x).mean(axis=(1, 2)), np.array):  # the image, then quarters of it
         (a, da), (b, db) = ((of(x).mean(axis=0), of(x).std(axis=0, ddof=1) / 2) for x in (found, means))
-        assert (np.hypot(da, db) < 0.03 * b).all(), (da / b, db / b)
-        assert (np.abs(a - b) < 0.01 * b + 4 * np.hypot(da, db)).all(), (a / b, np.hypot(da, db) / b)
+        noise, off = np.hypot(da, db) / b, np.abs(a / b - 1)
+        typical = np.sqrt(np.square(noise).mean())  # four images tell the noise of one quarter within 40 % alone
+        assert typical < 0.03 and (off < 0.01 + 4 * np.maximum(noise, typical)).all(), (a / b, noise)
     assert len(scene.integrator().gathered) == (2 if things is _by_a_model else 4)
