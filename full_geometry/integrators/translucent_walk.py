@@ -54,10 +54,11 @@ from halfspace_sss.interrupts import checkpoint, interruptible
 
 PARAMETERS = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters", "connection_share", "blur", "light", "layers")
 SAMPLES_PER_LAUNCH = 2**19
-GLINT, GLINTS = 8.0, 128  # least variance over the light, one of so many pixels at most
+GLINT, GLINTS, CANDIDATES = 8.0, 128, 8  # least variance over the light, one of so many pixels at most, those looked at
 PLACES, MOST_PLACES, SHARE = 32, 1024, 4  # least and most in each, for a sample; one for so many samples of the image
 NEAR = 1.5  # steps from pixel to pixel, within which what they mirror may be a rim
-FEWEST_TRIALS, TRIALS, LIT_RAYS = 2, 16, 2**13  # rays through each pixel that find them; rays that tell the light
+FEWEST_TRIALS, TRIALS, TRIAL_RAYS = 2, 16, 2**20  # rays through each pixel that find them; through all candidates
+LIT_RAYS = 2**13  # that tell the light
 LAYER = ["emission.R", "emission.G", "emission.B"]
 SAMPLES_PER_RAY = 4  # of the image, for each ray of light: these take a tenth of the time or less
 SAMPLES_PER_PATH = 8  # the same for each path of scattered light, which takes as long as a few samples
@@ -442,18 +443,20 @@ def _glints(tracer: PathTracer, sensor: mi.Sensor, trial: int) -> mi.UInt32:
     near, most = _near_mirrored(tracer, sensor), width * height // GLINTS
     pixels = aligned(mi.UInt32, np.arange(width * height, dtype=np.uint32))
     # of all pixels by few rays those about which it varies most, or may; of these by more rays
-    for rays, wide, kept in ((trial, 5, 2 * most), (PLACES, 3, most)):
+    for first, wide, kept in ((True, 5, CANDIDATES * most), (False, 3, most)):
+        more = min(max(TRIAL_RAYS // max(dr.width(pixels), 1), PLACES), MOST_PLACES)
+        rays = trial if first else 2 ** (more.bit_length() - 1)
         numbers = path_numbers(seeded(0, 3, rays), dr.width(pixels), 0, rays)
         places, weight, _ = rays_by(sensor, numbers, pixels)
         light = np.array(weight * tracer.seen_emission(tracer.shown(places)), dtype=float)
         light = light.reshape(len(light), -1, rays)
-        if rays == trial:  # other light is not asked for where nothing is seen
+        if first:  # other light is not asked for where nothing is seen
             least = GLINT * _other_light(tracer, sensor) if light.any() or near.any() else np.inf
         found = np.zeros((2, len(light), height * width))
         found[..., np.array(pixels)] = light.mean(axis=2), (light**2).mean(axis=2)
         means, squares = uniform_filter(found.reshape(2, -1, height, width), (0, 0, wide, wide))
         variance = (squares - means**2).sum(axis=0).ravel()
-        variance[near] += np.inf if rays == trial else 0
+        variance[near] += np.inf if first else 0
         number = min(int(np.count_nonzero(variance > least)), kept)
         pixels = aligned(mi.UInt32, np.sort(np.argsort(variance)[len(variance) - number :]))
         if number == 0:

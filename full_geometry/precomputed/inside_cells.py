@@ -295,11 +295,13 @@ def _solutions(moments: np.ndarray, place: np.ndarray, offset: np.ndarray) -> np
     np.add.at(moments, place[shares], moved)
 
     # ---- slopes about the centroid, C^-1 (b / V - x b_0 / V), and the value at the centre; by parts, to save memory
+    # a small part that shares no fit, as at a tip, has hardly a slope: its ridge grows as it gets smaller
     result, ridge = np.empty_like(moments), np.float32(RIDGE / 12) * np.eye(3, dtype=np.float32)
     for start in range(0, len(moments), AT_ONCE):
         M, A = (values[start : start + AT_ONCE] for values in (moments, result))
         V, x = M[:, :1, 0], M[:, 1:, 0] / M[:, :1, 0]
-        C = M[:, 1:, 1:] / V[:, :, None] - x[:, :, None] * x[:, None, :] + ridge
+        C = M[:, 1:, 1:] / V[:, :, None] - x[:, :, None] * x[:, None, :]
+        C += ridge * np.maximum(SMALLEST / V[:, :, None], 1)
         A[:, 1:, 1:] = _inverse(C) / V[:, :, None]
         A[:, 1:, 0] = -np.einsum("sij,sj->si", A[:, 1:, 1:], x)
         A[:, 0] = -np.einsum("sj,sjk->sk", x, A[:, 1:])
