@@ -7,7 +7,7 @@ import importlib
 import sys
 import threading
 from collections.abc import Callable, Iterable, Mapping
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 P, R = ParamSpec("P"), TypeVar("R")
 
@@ -31,6 +31,17 @@ def lazy_names(
         return sorted({*(name for name in defined if name.startswith("__")), *defined.get("__all__", ()), *homes})
 
     return get, names
+
+
+class LazyModule:
+    """A module that is imported when an attribute of it is first asked for: Dr.Jit, after `backend` has chosen an LLVM,
+    which it loads as it is imported."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __getattr__(self, attribute: str) -> Any:
+        return getattr(importlib.import_module(self._name), attribute)
 
 
 def once(f: Callable[P, R]) -> Callable[P, R]:

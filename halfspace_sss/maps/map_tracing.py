@@ -8,17 +8,19 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from types import ModuleType
 
-import drjit as dr
 import numpy as np
 
 from halfspace_sss.arrays import Lanes, library
 from halfspace_sss.backend import array_types
+from halfspace_sss.lazy import LazyModule
 from halfspace_sss.maps.grid import MapGrid, cell_edges, map_directions, radial_scale
 from halfspace_sss.physics.backbone import warp
 from halfspace_sss.physics.fresnel import F_t, mu_internal
 from halfspace_sss.physics.medium import Medium, eval_hg
 from halfspace_sss.tracing.passes import PATHS_PER_LANE, CellSums
 from halfspace_sss.tracing.walk import Scatter, Tally, at_lanes, pass_seed, walk
+
+dr = LazyModule("drjit")
 
 GROUP = 16  # observations that share a walk
 HITS = 2  # scores per event, one in each half of the summed contributions

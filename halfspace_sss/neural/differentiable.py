@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import drjit as dr
 import numpy as np
 
 from halfspace_sss.arrays import Lanes, broadcast_query, is_torch, library
 from halfspace_sss.interface.query import Query
+from halfspace_sss.lazy import LazyModule
 from halfspace_sss.neural.network import N_TERMS, log_calibrations, medium_features, symmetric_features, travel
 from halfspace_sss.neural.perceptron import Perceptron, cooperative, silu
 from halfspace_sss.neural.universal import Hypernetwork, Layers, load_hypernetwork, shipped_weights
 from halfspace_sss.physics.backbone import backbone_shape, length_scale
 from halfspace_sss.physics.fresnel import F_t
+
+dr = LazyModule("drjit")
 
 
 def neural_S(

@@ -15,14 +15,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from types import ModuleType
 
-import drjit as dr
 import numpy as np
 
 from halfspace_sss.arrays import Lanes, aligned
 from halfspace_sss.checks import check_edges, check_finite, check_interval
+from halfspace_sss.lazy import LazyModule
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.tracing.passes import CellSums, Estimate, Pass, estimate, find_cell
 from halfspace_sss.tracing.walk import Boundary, Scatter, Tally
+
+dr = LazyModule("drjit")
 
 LIGHT_SPEED = 0.299792458  # mm/ps, exact by the definition of the metre
 SHORTEST, LONGEST, LOG_STEP = 1e-3, 1e7, 0.02  # path lengths of the histogram, mean free paths; ln of the ratio of bins

@@ -14,17 +14,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from types import ModuleType
 
-import drjit as dr
 import numpy as np
 
 from halfspace_sss.arrays import aligned
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import as_count, check_choice, check_cosine, check_count, check_interval
+from halfspace_sss.lazy import LazyModule
 from halfspace_sss.physics.fresnel import F_r, mu_internal
 from halfspace_sss.physics.medium import Layers, sample_hg
 from halfspace_sss.progress import Progress
 from halfspace_sss.tracing.passes import BATCHES, CellSums, Estimate, checked_radii, estimate, find_cell, walk_passes
 from halfspace_sss.tracing.walk import Boundary, generator, in_launches, roulette, turn
+
+dr = LazyModule("drjit")
 
 LAYER_ORDERS = ("unscattered", "single", "multiple", "total")  # 0, 1, 2 or more events, and their sum
 

@@ -13,15 +13,17 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import NamedTuple
 
-import drjit as dr
 import numpy as np
 
 from halfspace_sss.arrays import Lanes, aligned
 from halfspace_sss.checks import check_choice, check_edges
+from halfspace_sss.lazy import LazyModule
 from halfspace_sss.physics.fresnel import F_t, mu_internal
 from halfspace_sss.physics.medium import Layers, Medium, eval_hg
 from halfspace_sss.progress import Progress
 from halfspace_sss.tracing.walk import Boundary, Scatter, Tally, pass_seed, walk
+
+dr = LazyModule("drjit")
 
 FIXED_POINT = 2.0**32  # quantum 2.3e-10 of a unit weight; a cell holds up to 4e9 unit weights
 BATCHES = 64  # independent groups of lanes, from whose spread the variance of a cell is taken

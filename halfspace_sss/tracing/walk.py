@@ -14,12 +14,14 @@ from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any, TypeVar
 
-import drjit as dr
 import numpy as np
 
 from halfspace_sss.arrays import Lanes
+from halfspace_sss.lazy import LazyModule
 from halfspace_sss.physics.fresnel import F_r
 from halfspace_sss.physics.medium import Medium, check_ratios, sample_hg
+
+dr = LazyModule("drjit")
 
 # least variance x time over the media (albedo, g, eta) = (0.75, 0, 1.3), (0.99, 0, 1.5), (0.999, 0.9, 1.3)
 ROULETTE_WEIGHT, ROULETTE_BOOST = 0.3, 3.0
