@@ -89,13 +89,14 @@ def _class(variant: str) -> type:
                 scene: of Mitsuba.
                 samples: of an image, by which corrected light has its walks; 0 for the light that is known.
             """
+            with undisturbed(), dr.suspend_grad():
+                return self._checked(scene, samples)[0]
+
+        def _checked(self, scene: mi.Scene, samples: int) -> tuple[list[TranslucentObject], mi.Integrator | None]:
+            """`_ready`, of a scene that can be rendered."""
             check_parameters(scene)
             check_emitters(scene)
-            with undisturbed(), dr.suspend_grad():
-                return self._prepared(scene, samples)
-
-        def _prepared(self, scene: mi.Scene, samples: int = 1) -> list[TranslucentObject]:
-            return self._ready(scene, samples)[0]
+            return self._ready(scene, samples)
 
         def _ready(self, scene: mi.Scene, samples: int = 1) -> tuple[list[TranslucentObject], mi.Integrator | None]:
             """The objects, and the walks that render them where their light is corrected."""
@@ -139,9 +140,7 @@ def _class(variant: str) -> type:
 
         def _render(self, scene: mi.Scene, samples: int, sensor: mi.Sensor, seed: mi.UInt32 | int, spp: int) -> None:
             """Fill the film of a sensor, in launches."""
-            check_parameters(scene)
-            check_emitters(scene)
-            objects, walk = self._ready(scene, samples)
+            objects, walk = self._checked(scene, samples)
             if walk is not None:
                 walk.render(scene, sensor, seed, spp, develop=False)
                 return

@@ -98,15 +98,8 @@ class Gathered:
 
     def radiance(self, out: SurfacePoint, active: mi.Bool) -> mi.Spectrum:
         """L_o of an exit; 0 below the horizon."""
-        # B.Y(w_o) at the exit, blended between points, w_o bent by the boundary
-        size = dr.size_v(mi.Spectrum)
-        B = self.points.blend(self.values, self.terms * size, out.p, out.n, active)
-        w = bent(out.w, out.n_out, self.albedo.eta)
-        Y = directional(w.x, w.y, w.z, dr.dot(w, out.n_out))
-        rows = [B[self.terms * c : self.terms * (c + 1)] for c in range(size)]
-        B = mi.Spectrum([sum(b * y for b, y in zip(row, Y)) for row in rows])
-
-        return dr.select(active & (dr.dot(out.w, out.n_out) > 0), self.factor(out, active) * dr.maximum(B, 0), 0)
+        B = _blended(self.points, self.values, self.terms, out, self.albedo.eta, active)
+        return dr.select(active & (dr.dot(out.w, out.n_out) > 0), self.factor(out, active) * B, 0)
 
     def factor(self, out: SurfacePoint, active: mi.Bool) -> mi.Spectrum:
         """L_o / B of an exit: a(w_o) R^e, or alpha in the channels where the model knows its directional albedo."""
@@ -150,6 +143,18 @@ class Gathered:
         return float((0.5 * by_light + PART * by_matrix) / whole) if whole > 0 else 1.0
 
 
+def _blended(
+    points: SurfacePoints, values: mi.Float, terms: int, out: SurfacePoint, eta: mi.Float | float, active: mi.Bool,
+    k: mi.Int32 | None = None,
+) -> mi.Spectrum:  # fmt: skip
+    """max(B.Y(w), 0) at an exit, B blended between points of object k, w bent by a boundary of this index."""
+    size, w = dr.size_v(mi.Spectrum), bent(out.w, out.n_out, eta)
+    B = points.blend(values, terms * size, out.p, out.n, active, k)
+    Y = directional(w.x, w.y, w.z, dr.dot(w, out.n_out))
+    rows = [B[terms * c : terms * (c + 1)] for c in range(size)]
+    return dr.maximum(mi.Spectrum([sum(b * y for b, y in zip(row, Y)) for row in rows]), 0)
+
+
 @dataclass(frozen=True, eq=False)
 class OutgoingLight:
     """Light that leaves objects at their surfaces, looked up by walks: a(w_o) max(B.Y(w_o), 0), without reflection.
@@ -183,21 +188,17 @@ class OutgoingLight:
         self, si: mi.SurfaceInteraction3f, k: mi.Int32, w: mi.Vector3f, active: mi.Bool
     ) -> tuple[mi.Bool, mi.Spectrum]:
         """Whether light that leaves object k is known, and that along w from a point with normals outwards."""
-        # B.Y(w), w bent by the boundary
-        active = active & dr.gather(mi.Bool, self.known, self.media.place_of(k))
-        out, size = surface_point(si.p, si.n, si.sh_frame.n, w), dr.size_v(mi.Spectrum)
-        B = self.points.blend(self.values, TERMS * size, out.p, out.n, active, self.media.place_of(k))
-        bent_w, L = bent(w, out.n_out, self.media.row("eta", k)), mi.Spectrum(0)
-        Y = directional(bent_w.x, bent_w.y, bent_w.z, dr.dot(bent_w, out.n_out))
-        B = mi.Spectrum([sum(b * y for b, y in zip(B[TERMS * c :], Y)) for c in range(size)])
-
+        place = self.media.place_of(k)
+        active = active & dr.gather(mi.Bool, self.known, place)
+        out, L = surface_point(si.p, si.n, si.sh_frame.n, w), mi.Spectrum(0)
+        B = _blended(self.points, self.values, TERMS, out, self.media.row("eta", k), active, place)
         # a(w) of each object, with the medium that textures have here
         for kind in range(len(self.media.objects)):
             light = next((self.lights[k] for k in self.media.instance_table.numbers(kind) if self.lights[k]), None)
             if light is not None:
                 here = active & self.media.has_shape(k, kind)
                 a = light.factor(out._replace(medium=light.object.medium_at(si)), here)
-                L = dr.select(here, a * dr.maximum(B, 0), L)
+                L = dr.select(here, a * B, L)
         return active, dr.select(dr.dot(w, out.n_out) > 0, L, 0)
 
 
@@ -278,7 +279,7 @@ def _check(obj: TranslucentObject, light: str) -> None:
     result = obj.geometry
     if not result.closed or not result.area > 0:
         lacks = "is not closed" if not result.closed else f"is a {result.shape.class_name()} without known area"
-        raise ValueError(f"light must be sampled for object {result.name}, which {lacks}, got gathered")
+        raise ValueError(f"light must be sampled for object {result.name}, which {lacks}, got {light}")
     if obj.wrapping.bend is not None and light != "corrected":
         raise ValueError(
             f"light must be sampled for object {result.name}, which has a normal or bump map, got gathered"

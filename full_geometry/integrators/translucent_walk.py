@@ -57,7 +57,7 @@ SAMPLES_PER_LAUNCH = 2**19
 GLINT, GLINTS, CANDIDATES = 8.0, 128, 8  # least variance over the light, one of so many pixels at most, those looked at
 PLACES, MOST_PLACES, SHARE = 32, 1024, 4  # least and most in each, for a sample; one for so many samples of the image
 NEAR = 1.5  # steps from pixel to pixel, within which what they mirror may be a rim
-FEWEST_TRIALS, TRIALS, TRIAL_RAYS = 2, 16, 2**20  # rays through each pixel that find them; through all candidates
+FEWEST_TRIALS, TRIALS, TRIAL_RAYS = 2, 16, 4  # rays through each pixel that find them; through candidates, a pixel
 LIT_RAYS = 2**13  # that tell the light
 LAYER = ["emission.R", "emission.G", "emission.B"]
 SAMPLES_PER_RAY = 4  # of the image, for each ray of light: these take a tenth of the time or less
@@ -444,7 +444,7 @@ def _glints(tracer: PathTracer, sensor: mi.Sensor, trial: int) -> mi.UInt32:
     pixels = aligned(mi.UInt32, np.arange(width * height, dtype=np.uint32))
     # of all pixels by few rays those about which it varies most, or may; of these by more rays
     for first, wide, kept in ((True, 5, CANDIDATES * most), (False, 3, most)):
-        more = min(max(TRIAL_RAYS // max(dr.width(pixels), 1), PLACES), MOST_PLACES)
+        more = min(max(TRIAL_RAYS * width * height // max(dr.width(pixels), 1), PLACES), MOST_PLACES)
         rays = trial if first else 2 ** (more.bit_length() - 1)
         numbers = path_numbers(seeded(0, 3, rays), dr.width(pixels), 0, rays)
         places, weight, _ = rays_by(sensor, numbers, pixels)

@@ -665,26 +665,28 @@ class PathTracer:
     def mirrored(self, rays: mi.Ray3f) -> tuple[mi.Point3f, mi.Vector3f, mi.Bool]:
         """Where rays go on from the objects that they meet first, along what smooth boundaries mirror; whether any."""
         media, walk = self.visitor.media, start_walk(rays.o, rays.d, generator(mi, dr.width(rays), pass_seed(0)))
-        si = media.instance_scene.intersect(self.visitor.scene, rays, mi.RayFlags.All)
+        si, k, boundary, found = self._reflector(walk, dr.full(mi.Bool, True, dr.width(rays)))
+        walk, found = _along_mirror(media, walk, si, boundary, found & ~media.row("rough", k))
+        return walk.o, walk.d, found
+
+    def _reflector(self, walk: Walk, active: mi.Bool) -> tuple[mi.SurfaceInteraction3f, mi.Int32, mi.BSDFPtr, mi.Bool]:
+        """What ways meet as objects show it: the point, the object, its boundary, and whether that reflects."""
+        media = self.visitor.media
+        si = media.instance_scene.intersect(
+            self.visitor.scene, mi.Ray3f(walk.o, walk.d), mi.RayFlags.All, active=active
+        )
         k = media.index_of(si, si.is_valid())
         near = dr.maximum(k, 0)
-        found = (k >= 0) & media.row("reflects", near) & ~media.row("rough", near)
-        walk, found = _along_mirror(media, walk, media.seen(si, k, rays.d), media.boundary_pointer(near), found)
-        return walk.o, walk.d, found
+        active = active & (k >= 0) & media.row("reflects", near)
+        return media.seen(si, k, walk.d), near, media.boundary_pointer(near), active
 
     def _mirrored(self, walk: Walk, active: mi.Bool, levels: int) -> mi.Spectrum:
         """Emission in the mirrors of objects that a way along mirrored directions meets, and behind them."""
         media, L = self.visitor.media, mi.Spectrum(0)
         for level in range(levels):
             # ---- emission seen at the surface
-            ray = mi.Ray3f(walk.o, walk.d)
-            si = media.instance_scene.intersect(self.visitor.scene, ray, mi.RayFlags.All, active=active)
-            k = media.index_of(si, si.is_valid())
-            near = dr.maximum(k, 0)
-            si = media.seen(si, k, walk.d)
-            active = active & (k >= 0) & media.row("reflects", near)
-            boundary = media.boundary_pointer(near)
-            mirrored, behind = self.visitor.seen_emitters(walk, si, boundary, near, active)
+            si, k, boundary, active = self._reflector(walk, active)
+            mirrored, behind = self.visitor.seen_emitters(walk, si, boundary, k, active)
             L = L + mirrored.light + behind.light
             if level + 1 < levels:
                 walk, active = _along_mirror(media, walk, si, boundary, mirrored.found)

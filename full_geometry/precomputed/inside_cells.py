@@ -83,7 +83,6 @@ class InsideCells:
         cut: (cut,) slots of the cells that the surface cuts; all others are whole.
         place: (cut,) of each of them the place in `cut` of the cell whose fit it shares, its own for most.
         offset: of each the way from the centre of that one, in units of h.
-        chord: mean chord of the object, 4 V / A, scene units.
         solve: (cut, 4, 4) in a row, coefficients of its fit from the moments ∫ f x_j dx / h³ of all that share it.
     """
 
@@ -92,7 +91,6 @@ class InsideCells:
     counts: np.ndarray
     index: CellIndex
     slots: int
-    chord: float
     cut: mi.UInt32
     place: mi.UInt32
     offset: mi.Vector3f
@@ -101,7 +99,7 @@ class InsideCells:
     @classmethod
     def of(
         cls, media: WalkMedia, k: int, points: SurfaceParts, box: tuple[np.ndarray, np.ndarray], h: float,
-        depths: tuple[float, float], chord: float,
+        depths: tuple[float, float],
     ) -> InsideCells:  # fmt: skip
         """The cells of object k.
 
@@ -112,7 +110,6 @@ class InsideCells:
             box: its least and largest coordinates.
             h: edge of a cell, from `cell_edge`.
             depths: below the surface, beyond which cells are coarse, and beyond which there are none, scene units.
-            chord: its mean chord.
         """
         # ---- bricks that the surface cuts and those near them, and cells of the former that it cuts
         counts = brick_counts(box, h)
@@ -143,7 +140,7 @@ class InsideCells:
         index, slot, slots = _numbered(held, fine, coarse, len(surface))
         place, offset = _parents(cells, moments[:, 0, 0], BRICK * counts)
         return cls(
-            low=low, h=h, counts=counts, index=index, slots=slots, chord=chord,
+            low=low, h=h, counts=counts, index=index, slots=slots,
             cut=aligned(mi.UInt32, slot[at[row], bit]), place=aligned(mi.UInt32, place),
             offset=of_rows(mi.Vector3f, offset), solve=floats(_solutions(moments, place, offset)),
         )  # fmt: skip

@@ -257,9 +257,8 @@ def inside_cells_of(
         if same and _grid(before, k)[1:] == (h, depths):
             results.append(cells[k])
             continue
-        area, volume = _extent(media, k)
-        points = partial(_surface_points, media, k, area)
-        results.append(InsideCells.of(media, k, points, box, h, depths, 4 * volume / area))
+        points = partial(_surface_points, media, k, _extent(media, k)[0])
+        results.append(InsideCells.of(media, k, points, box, h, depths))
     return results
 
 

@@ -104,16 +104,17 @@ class BSSRDF(abc.ABC):
             ValueError: an argument is out of range or not a number (NumPy and torch; Dr.Jit lanes cannot be
                 inspected while a kernel is recorded), or libraries are mixed.
         """
-        query, channels = (r, mu_i, phi_i, mu_o, phi_o), self.medium.n_channels is not None
-        return labelled(functools.partial(self._S, self.G), query, "S", channels)
+        return self._S(self.G, r, mu_i, phi_i, mu_o, phi_o)
 
     def eval_unclamped(self, r: Real, mu_i: Real, phi_i: Real, mu_o: Real, phi_o: Real) -> Real:
         """`eval` without the clamp that keeps a model from turning negative; the same where it has none."""
-        query, channels = (r, mu_i, phi_i, mu_o, phi_o), self.medium.n_channels is not None
-        return labelled(functools.partial(self._S, self.G_unclamped), query, "S", channels)
+        return self._S(self.G_unclamped, r, mu_i, phi_i, mu_o, phi_o)
 
     def _S(self, G_of: Callable[[Query], Real], *query: Real) -> Real:
-        """sigma_t² T_12 T_21 G_of(query)."""
+        """sigma_t² T_12 T_21 G_of(query), with the labels of the query."""
+        return labelled(functools.partial(self._S_of_arrays, G_of), query, "S", self.medium.n_channels is not None)
+
+    def _S_of_arrays(self, G_of: Callable[[Query], Real], *query: Real) -> Real:
         lib, args = broadcast_query(*query, names=("r", "mu_i", "phi_i", "mu_o", "phi_o"))
         if asks_nothing(lib, args):
             return type(args[0])()
