@@ -95,16 +95,6 @@ def test_the_recipe_of_conda_asks_for_the_versions_of_the_package() -> None:
     assert (recipe["package"]["version"], recipe["about"]["license"]) == (project["version"], project["license"])
 
 
-def test_the_extras_all_and_test_hold_those_of_the_others() -> None:
-    """They name no extra: with these pip 23.0 looks for versions without end once the package is installed."""
-    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
-    of_users = {name for name in extras if name not in ("all", "docs", "test")}
-    wanted = {each for name in of_users for each in extras[name]}
-    assert set(extras["all"]) == wanted
-    assert set(extras["test"]) >= wanted | set(extras["docs"])
-    assert not [each for extra in extras.values() for each in extra if each.startswith("halfspace-sss")]
-
-
 def test_notebooks_install_the_library_and_hold_the_cells_of_their_scripts(site: Path) -> None:
     scripts = sorted((ROOT / "docs" / "notebooks").glob("*.py"))
     for script in scripts:
