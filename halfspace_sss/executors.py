@@ -13,6 +13,7 @@ import threading
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
+from graphlib import CycleError, TopologicalSorter
 from heapq import heappop, heappush
 from pathlib import Path
 from queue import SimpleQueue
@@ -52,16 +53,16 @@ def completed(
             where Dr.Jit hangs.
         BackendError: a worker ended.
     """
-    names, left = list(parts), {name: parts.keys() & set((needs or {}).get(name, ())) for name in parts}
-    after: dict[str, list[int]] = {}
-    for k, name in enumerate(names):
-        for needed in left[name]:
-            after.setdefault(needed, []).append(k)
-    ready = [k for k, name in enumerate(names) if not left[name]]  # sorted, and so a heap
+    order = TopologicalSorter({name: parts.keys() & set((needs or {}).get(name, ())) for name in parts})
+    try:
+        order.prepare()
+    except CycleError as error:
+        raise ValueError(f"parts must not need each other in a circle, got {', '.join(error.args[1][:-1])}") from None
+    names, ready = list(parts), []
+    places = {name: k for k, name in enumerate(names)}
     most = 1 if executor is None else most or len(names)
     futures: dict[Future, str] = {}
     ended: SimpleQueue[Future] = SimpleQueue()
-    count = 0
 
     def started(name: str) -> Future:
         if executor is not None:
@@ -72,22 +73,17 @@ def completed(
         return here
 
     try:
-        while ready or futures:
+        while order.is_active():
+            for name in order.get_ready():
+                heappush(ready, places[name])
             while ready and len(futures) < most:
                 name = names[heappop(ready)]
                 futures[future := started(name)] = name
                 future.add_done_callback(ended.put)
             with _naming(name := futures.pop(future := ended.get())):
                 result = future.result()
-            for k in after.get(name, ()):
-                left[names[k]].remove(name)
-                if not left[names[k]]:
-                    heappush(ready, k)
-            count += 1
+            order.done(name)
             yield name, result
-        if count < len(names):
-            circle = ", ".join(name for name in names if left[name])
-            raise ValueError(f"parts must not need each other in a circle, got {circle}")
     finally:
         for future in futures:
             future.cancel()
