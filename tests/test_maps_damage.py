@@ -51,18 +51,6 @@ def test_a_coordinate_with_another_last_bit_is_refused_by_name(coordinate: str, 
             read()
 
 
-def test_a_store_of_before_whose_coordinates_have_no_checksums_is_read(tmp_path: Path) -> None:
-    path = make_maps(MEDIA, tmp_path, **HOW)["m"]
-    maps = load_maps(path)
-    for name in (".zattrs", ".zmetadata"):
-        about = json.loads((path / name).read_text())
-        attributes = about if name == ".zattrs" else about["metadata"][".zattrs"]
-        del attributes["checksums_of_coordinates"]
-        (path / name).write_text(json.dumps(about))
-    assert load_maps(path).equals(maps)
-    make_maps(MEDIA, tmp_path, **HOW)
-
-
 def test_checksums_of_coordinates_are_those_of_their_numbers(tmp_path: Path) -> None:
     maps = load_maps(make_maps(MEDIA, tmp_path, **HOW)["m"])
     written = json.loads(maps.attrs["checksums_of_coordinates"])

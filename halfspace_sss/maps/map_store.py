@@ -13,7 +13,7 @@ import os
 import shutil
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
 from dataclasses import asdict
 from pathlib import Path
@@ -52,11 +52,9 @@ def written_checksums(dataset: xr.Dataset) -> dict[str, str | int]:
 
 
 def check_written(dataset: xr.Dataset) -> None:
-    """ValueError names what is not as it was written; stores of before have no checksums, or fewer."""
-    if ATTRIBUTE in dataset.attrs and dataset.attrs[ATTRIBUTE] != zlib.crc32(dataset.attrs[ASKED].encode()):
+    """ValueError names what is not as it was written."""
+    if dataset.attrs[ATTRIBUTE] != zlib.crc32(dataset.attrs[ASKED].encode()):
         raise ValueError(f"attribute {ASKED} does not match its checksum")
-    if COORDINATES not in dataset.attrs:
-        return
     written, result = json.loads(dataset.attrs[COORDINATES]), _coordinates(dataset)
     for name in sorted(written.keys() | result.keys()):
         if written.get(name) != result.get(name):
@@ -70,32 +68,35 @@ def _coordinates(dataset: xr.Dataset) -> dict[str, int]:
 HEAD = struct.Struct("<4B3I")  # versions, flags, size of a number; bytes, bytes of a block, compressed bytes
 
 
-def check_chunks(path: Path) -> None:
-    """ValueError if a chunk of a Zarr store that Blosc compressed has not the sizes that its head tells."""
+def _chunks(path: Path) -> Iterator[tuple[Path, JsonDict]]:
+    """The chunks of a Zarr store that Blosc compressed, and what the store says of their arrays."""
     for array in sorted(path.glob("*/.zarray")):
         about = json.loads(array.read_text(encoding="utf-8"))
-        if (about.get("compressor") or {}).get("id") != "blosc":
-            continue
-        size = math.prod(about["chunks"]) * np.dtype(about["dtype"]).itemsize
-        for chunk in array.parent.iterdir():
-            if not chunk.name.startswith("."):
-                _check_chunk(chunk, size)
+        if (about.get("compressor") or {}).get("id") == "blosc":
+            yield from ((chunk, about) for chunk in array.parent.iterdir() if not chunk.name.startswith("."))
+
+
+def check_chunks(path: Path) -> None:
+    """ValueError if a chunk of a Zarr store that Blosc compressed has not the sizes that its head tells."""
+    for chunk, about in _chunks(path):
+        size, (told, length) = math.prod(about["chunks"]) * np.dtype(about["dtype"]).itemsize, _told(chunk)
+        if told[0] != size or not 0 < told[1] <= size or told[2] != length:
+            place = f"{chunk.parent.name}/{chunk.name}"
+            raise ValueError(f"chunk {place} must be of {size} bytes, {length} compressed, got {told}")
 
 
 def drop_cut_off(path: Path, units: set[tuple[int, int]]) -> None:
     """Remove chunks of units, by (channel, direction), shorter than their heads tell: they then are missing."""
-    for array in sorted(path.glob("*/.zarray")):
-        about = json.loads(array.read_text(encoding="utf-8"))
-        if (about.get("compressor") or {}).get("id") != "blosc":
-            continue
-        for chunk in array.parent.iterdir():
-            place = chunk.name.split(".")
-            if len(place) < 2 or not all(part.isdecimal() for part in place[:2]):
-                continue
-            if about["chunks"][:2] == [1, 1] and (int(place[0]), int(place[1])) in units:
-                told, length = _told(chunk)
-                if length < max(told[2], HEAD.size):
-                    chunk.unlink()
+    for chunk, about in _chunks(path):
+        place = chunk.name.split(".")[:2]
+        if (
+            about["chunks"][:2] == [1, 1]
+            and all(part.isdecimal() for part in place)
+            and tuple(map(int, place)) in units
+        ):
+            told, length = _told(chunk)
+            if length < max(told[2], HEAD.size):
+                chunk.unlink()
 
 
 def _told(chunk: Path) -> tuple[tuple[int, int, int], int]:
@@ -103,14 +104,6 @@ def _told(chunk: Path) -> tuple[tuple[int, int, int], int]:
     with chunk.open("rb") as file:
         head = file.read(HEAD.size)
     return HEAD.unpack(head)[4:] if len(head) == HEAD.size else (0, 0, 0), chunk.stat().st_size
-
-
-def _check_chunk(chunk: Path, size: int) -> None:
-    told, length = _told(chunk)
-    if told[0] != size or not 0 < told[1] <= size or told[2] != length:
-        raise ValueError(
-            f"chunk {chunk.parent.name}/{chunk.name} must be of {size} bytes, {length} compressed, got {told}"
-        )
 
 
 FORMAT = 1
@@ -274,8 +267,7 @@ def _template(medium: Medium, grid: MapGrid, seed: int) -> xr.Dataset:
         "psi_edges": ("psi_edge", psi, {"units": "radian", "long_name": "azimuth of x_o - x_i from forward"}),
         "mfp": ("channel", np.atleast_1d(medium.mfp), {"units": "mm"}),
     }
-    dataset = xr.Dataset(data, coords)
-    return dataset
+    return xr.Dataset(data, coords)
 
 
 def _create(path: Path, medium: Medium, grid: MapGrid, seed: int, asked: JsonDict) -> None:
