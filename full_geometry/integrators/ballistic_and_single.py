@@ -263,15 +263,8 @@ def light_at_events(
     ways: tuple[mi.Vector3f, mi.Float], u: mi.Point2f, sampler: mi.Sampler,
 ) -> LightAtEvents:  # fmt: skip
     """Light at places inside an object, along directions and by connections.
-
-    Args:
-        context: of the scene.
-        obj: the object, of one medium.
-        at: places, and outward geometric normals near them.
-        ways: directions, and the inverse of their density, sr.
-        u: uniform numbers of emitters.
-        sampler: of what else is random.
-    """
+    `obj`: the object, of one medium. `at`: places, and outward geometric normals near them. `ways`: directions, and the
+    inverse of their density, sr."""
     # ---- walks that begin at their event, scaled so that roulette meets a weight about 1
     (p, n), (d, inverse_pdf), m = at, ways, _coefficients(obj, ())
     scale = 1 / dr.maximum(dr.max(m.sigma_s), 1e-30)
@@ -337,7 +330,7 @@ def _to_boundary(obj: TranslucentObject, walk: OneEventWalk) -> tuple[tuple, mi.
 
 def _by_channel(media: list[tuple[mi.Float, mi.Float, mi.Float]]) -> Coefficients:
     """The coefficients of sigma_s, sigma_t and g of each channel."""
-    sigma_s, sigma_t, g = (mi.Spectrum(*v) if len(v) > 1 else mi.Spectrum(v[0]) for v in zip(*media))
+    sigma_s, sigma_t, g = (mi.Spectrum(v) for v in zip(*media))
     return Coefficients(sigma_t=sigma_t, sigma_s=sigma_s, g=g, majorant=sigma_t, mean_t=sigma_t)
 
 
@@ -512,15 +505,8 @@ def _connected(
     others: tuple[mi.Bool | bool, float] = (True, 1.0),
 ) -> list[tuple[mi.Spectrum, mi.Vector3f]]:  # fmt: skip
     """Light of a sampled emitter that reaches an event by refraction or one reflection more.
-
-    Args:
-        context: of the scene.
-        at: the event.
-        u: uniform numbers of the emitter.
-        sampler: of what else is random.
-        environment: whether the environment counts.
-        active: lanes that count.
-        others: where ways that no straight line leads to are looked for, and how much they count there.
+    `environment`: whether the environment counts. `others`: where ways that no straight line leads to are looked for,
+    and how much they count there.
 
     Returns:
         Of each way the light, without the phase function, and its direction at the event.

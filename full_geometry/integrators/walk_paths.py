@@ -90,7 +90,6 @@ class Behind(NamedTuple):
 
     Args:
         member: whether the surface is a boundary to an object or in one.
-        bsdf: of the surface.
         object: the number of the object behind it, or OUTSIDE.
         within: see `Walk.within`.
         unlit: whether emitters are met by chance alone: a medium, or boundaries that are hidden, are between.
@@ -132,9 +131,6 @@ class LightVisitor:
     """Light gathered at the events and boundaries of walks.
 
     Args:
-        scene: the Mitsuba scene.
-        media: its translucent objects.
-        small: its small emitters, if there are any.
         connections: of events with light subpaths of small emitters, if there are any.
         directions: from events to small emitters, where connections cannot find their light.
         straight_light: of emitters through boundaries of index 1, if there are any.
@@ -940,9 +936,7 @@ class FirstExits:
 
     def of_object(self, k: int) -> FirstExits:
         """The lanes of paths that meet object k first."""
-        kept = dr.compress(self.object == k)
-        lanes = {name: dr.gather(type(value), value, kept) for name, value in vars(self).items()}
-        result = FirstExits(**lanes)
+        result = self.gather(dr.compress(self.object == k))
         dr.eval(result)
         return result
 

@@ -181,10 +181,7 @@ class TexturedMedium:
 
     def values_on(self, shape: mi.Shape) -> tuple[np.ndarray, np.ndarray]:
         """Albedo and sigma_t of texels and attributes, shapes (n, channels); of a texture of another kind none."""
-        values = {
-            name: np.concatenate([texels(texture), attributes(name, texture, shape)])
-            for name, texture in self.textures.items()
-        }
+        values = {name: _values_on(name, texture, shape) for name, texture in self.textures.items()}
         albedo = values.get("albedo", np.atleast_2d(self.albedo)) if self.table is None else values["reflectance"].T
         if self.table is not None:
             albedo = np.array(self.table(mi.Spectrum(albedo.astype(np.float32)))).reshape(albedo.shape).T
@@ -207,10 +204,7 @@ class TexturedMedium:
     def is_even(self, shape: mi.Shape) -> bool:
         """Whether its textures are the same everywhere on a shape, and no derivatives by them are followed.
         Models are then those of the medium itself, which differ by 0.3 % between nodes of the albedo."""
-        values = [
-            np.concatenate([texels(texture), attributes(name, texture, shape)])
-            for name, texture in self.textures.items()
-        ]
+        values = [_values_on(name, texture, shape) for name, texture in self.textures.items()]
         even = all(len(v) > 0 and (v == v[0]).all() for v in values)
         nodes = [node for texture in self.textures.values() for node in mi.traverse(texture).hierarchy]
         known = all(kind_of(node) in KNOWN for node in nodes)
@@ -349,10 +343,13 @@ def _by_uv(texture: mi.Texture) -> bool:
     return any(kind_of(node) in BY_UV for node in mi.traverse(texture).hierarchy)
 
 
+def _values_on(name: str, texture: mi.Texture, shape: mi.Shape) -> np.ndarray:
+    """Texels, and attributes of a shape, that a texture shows, shape (n, channels of the variant)."""
+    return np.concatenate([texels(texture), attributes(name, texture, shape)])
+
+
 def _mean(name: str, texture: mi.Texture, shape: mi.Shape | None) -> np.ndarray:
-    values = texels(texture)
-    if shape is not None:
-        values = np.concatenate([values, attributes(name, texture, shape)])
+    values = texels(texture) if shape is None else _values_on(name, texture, shape)
     if len(values) and (values == values[0]).all():
         return values[0]  # to the last bit
     return values.mean(axis=0) if len(values) else np.full(len(mi.Spectrum(0)), UNKNOWN[name])

@@ -60,7 +60,7 @@ class Mixed(NamedTuple):
 
 def mean_chord(obj: TranslucentObject) -> float:
     """4 V/A, V from the mean of x.n over random points of the surface; <= 0 where it is open or inside out."""
-    at = obj.random_points(generator(_mitsuba(), POINTS, pass_seed(SEED)))
+    at = obj.random_points(generator(mi, POINTS, pass_seed(SEED)))
     x, n = (np.array(v, dtype=float) for v in (at.p, at.n))
     x -= x.mean(axis=1, keepdims=True)
     return float(4 / 3 * (x * n).sum(axis=0).mean())
@@ -68,7 +68,7 @@ def mean_chord(obj: TranslucentObject) -> float:
 
 def mixed(obj: TranslucentObject) -> list[Mixed]:
     """What each channel mixes; M and m_2 are 0 where there is no scattering or no volume."""
-    at = obj.random_points(generator(_mitsuba(), POINTS, pass_seed(SEED)))
+    at = obj.random_points(generator(mi, POINTS, pass_seed(SEED)))
     entering, chord = refract_in(at, obj.eta)[1], max(mean_chord(obj), 0.0)
     isotropic = tuple(Medium(float(m.sigma_s) * (1 - float(m.g)), float(m.sigma_a), 0.0, m.eta) for m in obj.media)
     kinds = [obj.media, isotropic, tuple(Medium(m.sigma_s, m.sigma_a, m.g, 1.0) for m in obj.media)]
@@ -95,12 +95,6 @@ def _stays(m: Medium, chord: float, scattered: float) -> float:
     """q of a medium."""
     escapes = scattered / (float(m.sigma_t) * chord * m.eta**2)
     return 1 - min(max(escapes, LEAST_ESCAPE), 1.0)
-
-
-def _mitsuba() -> object:
-    import mitsuba
-
-    return mitsuba
 
 
 # ---- Lines between two points, and where light would go if the surface between them were a plane ---

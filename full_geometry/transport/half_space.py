@@ -58,8 +58,7 @@ class HalfSpaceTransport(Transport):
         query = plane_query(at, exit, self.geometry)
         above = active & (at.mu > 0) & (query[3] > 0)
         asked = in_double(query) if self.precise else query
-        values = [mi.Float(model.eval(*asked)) for model in self.models]
-        return dr.select(above, mi.Spectrum(*values) if len(values) > 1 else mi.Spectrum(values[0]), 0)
+        return dr.select(above, mi.Spectrum([mi.Float(model.eval(*asked)) for model in self.models]), 0)
 
     def perturbed(self, media: Sequence[Medium]) -> HalfSpaceTransport:
         """See `medium_derivatives.PerturbableTransport`."""
@@ -111,11 +110,15 @@ def half_space_model(name: str, geometry: Geometry, media: Sequence[Medium], set
     """The transport and the proposals of a half-space model on an object.
     `media`: of each channel, 1/(scene unit). `settings`: geometry and share of uniform entries."""
     models = [bssrdf(name, m) for m in media]
-    table = radial_table([model for model, m in zip(models, media) if float(m.sigma_s) > 0], name, geometry)
+    positions = positions_of([each for each, m in zip(models, media) if float(m.sigma_s) > 0], name, geometry, settings)
+    return ObjectModel(HalfSpaceTransport(models, settings.geometry), HalfSpaceProposals(positions, models[0]))
+
+
+def positions_of(models: list[BSSRDF], name: str, geometry: Geometry, settings: Settings) -> PositionSampler:
+    """Entries of an object by the mean of models of a name, and over the area."""
+    table = radial_table(models, name, geometry)
     share = area_share(geometry, table.mean / geometry.size, settings.area_share)
-    positions = PositionSampler(geometry, table, AreaPoints(geometry.shape), share)
-    transport = HalfSpaceTransport(models, settings.geometry)
-    return ObjectModel(transport, HalfSpaceProposals(positions, models[0]))
+    return PositionSampler(geometry, table, AreaPoints(geometry.shape), share)
 
 
 def radial_table(models: list[BSSRDF], name: str, geometry: Geometry) -> RadialTable:

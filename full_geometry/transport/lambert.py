@@ -30,9 +30,8 @@ class LambertTransport(Transport):
 
     def S(self, exit: SurfacePoint, at: SurfacePoint, active: mi.Bool = True) -> mi.Spectrum:
         """Over the density of `LambertProposals.sample`, whose point is the only one."""
-        R = self.reflectance(exit)
         above = active & (dr.dot(exit.w, exit.n_out) > 0)
-        return dr.select(above, (mi.Spectrum(*R) if len(R) > 1 else mi.Spectrum(R[0])) * dr.inv_pi, 0)
+        return dr.select(above, mi.Spectrum(self.reflectance(exit)) * dr.inv_pi, 0)
 
 
 class ReflectanceTable:

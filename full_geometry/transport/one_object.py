@@ -95,9 +95,6 @@ class HalfSpace:
         return query, F_t, (mu_i > 0) & (mu_o > 0) & (dr.dot(o.w, o.n) > 0) & (dr.dot(i.w, i.n) > 0)
 
 
-# ---- S of one object: a base model times what a small network has learnt, evaluated in Dr.Jit ----------
-
-
 # ---- What leaves at an exit under the same light from everywhere, learnt beside S ------------------
 # Of the light that F_t lets in, 1 - P leaves without an event; the rest leaves after one, alpha_1, or after more,
 #

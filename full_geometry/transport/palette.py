@@ -38,21 +38,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.geometry.points import (
-    AreaPoints,
-    ObjectModel,
-    PositionSampler,
-    SurfacePoint,
-    Transport,
-    floats,
-    opaque,
-    plane_query,
-)
+from full_geometry.geometry.points import ObjectModel, SurfacePoint, Transport, floats, opaque, plane_query
 from full_geometry.geometry.shape import Geometry
 from full_geometry.settings import Settings
 from full_geometry.surface.spectral import MediumByWavelength
 from full_geometry.surface.textured import MediumAt, Number, TexturedMedium, bend, x_of_albedo
-from full_geometry.transport.half_space import HalfSpaceProposals, area_share, radial_table
+from full_geometry.transport.half_space import HalfSpaceProposals, positions_of
 from halfspace_sss import measure
 from halfspace_sss.arrays import broadcast_query
 from halfspace_sss.interface.model import BSSRDF
@@ -457,9 +448,7 @@ def palette_model(
     geometry and share of uniform entries. ValueError if the model knows some media only."""
     palette = palette_of(name, geometry, media, medium)
     models = _spread(name, *_values_of(geometry, media, medium), media)
-    table = radial_table(models, name, geometry)
-    share = area_share(geometry, table.mean / geometry.size, settings.area_share)
-    positions = PositionSampler(geometry, table, AreaPoints(geometry.shape), share)
+    positions = positions_of(models, name, geometry, settings)
     transport = PaletteTransport(palette, geometry, medium, settings.geometry)
     known = medium if isinstance(medium, TexturedMedium) else None  # else that of the exit
     return ObjectModel(transport, HalfSpaceProposals(positions, models[0], known))

@@ -15,11 +15,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from halfspace_sss.arrays import aligned, library
+from halfspace_sss.arrays import library
 from halfspace_sss.executors import completed
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.maps.grid import draw_media
 from halfspace_sss.maps.noisy_maps import LEAST_ALBEDO, CellGrid, Groups, make_pool, radial_edges
+from halfspace_sss.measure.reflected_flux import evaluated
 from halfspace_sss.noise_free import NoiseFree
 from halfspace_sss.physics.backbone import unwarp
 from halfspace_sss.physics.fresnel import F_t, mu_internal
@@ -86,21 +87,14 @@ def _part(
     area = (r * L / (1 + np.exp(-u)) * u_weight)[:, None, :, None] * psi_weight
     mu_i, mu_o = groups.mu_i[rows][..., None, None], groups.mu_o[rows, columns][..., None, None]
     phi_o = groups.delta_phi[rows, columns][..., None, None] - psi
-    S = evaluated(model, (r[:, None, :, None], mu_i, math.pi - psi, mu_o, phi_o))
+    S = in_single(model, (r[:, None, :, None], mu_i, math.pi - psi, mu_o, phi_o))
     E = S * area * mu_i * mu_o
     return E.reshape(*E.shape[:2], grid.n_u, N_U, grid.n_psi, n_psi).sum(axis=(3, 5))
 
 
-def evaluated(model: BSSRDF, query: tuple[np.ndarray, ...]) -> np.ndarray:
-    """S of NumPy arrays in single precision, in the library that is fastest for the model; the result in double."""
-    query = np.broadcast_arrays(*(np.asarray(v, np.float32) for v in query))
-    if model.fast_in == "drjit":
-        from drjit.llvm import Float
-
-        S = np.asarray(model.eval(*(aligned(Float, v) for v in query)))
-    else:
-        S = model.eval(*query)
-    return np.asarray(S, np.float64).reshape(query[0].shape)
+def in_single(model: BSSRDF, query: tuple[np.ndarray, ...]) -> np.ndarray:
+    """`evaluated` in single precision."""
+    return evaluated(model, tuple(np.asarray(v, np.float32) for v in query))
 
 
 def _points(edges: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:

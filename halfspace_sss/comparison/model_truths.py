@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from halfspace_sss.comparison.model_errors import evaluated
+from halfspace_sss.comparison.model_errors import in_single
 from halfspace_sss.comparison.truths import Truth, read_truths
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.measure.reflected_flux import reflectance_estimate
@@ -57,7 +57,7 @@ def exits(model: BSSRDF, mu_i: Sequence[float | str], points: int, seed: Sequenc
     two; scrambled Sobol points, others for each row."""
     rows = [_draw(model, mu, points, (*seed, k)) for k, mu in enumerate(mu_i)]
     p = _Points(*(np.stack(values) for values in zip(*rows)))
-    S = evaluated(model, (p.r, p.mu_i, math.pi - p.psi, p.mu_o, p.delta - p.psi))
+    S = in_single(model, (p.r, p.mu_i, math.pi - p.psi, p.mu_o, p.delta - p.psi))
     weight = np.where(np.arange(p.r.shape[1]) < points, 1.0, _weight(p.mu_i))
     return SampledExits(p.r, p.mu_o, S * p.mu_o * weight / (_density(model, p) * points))
 

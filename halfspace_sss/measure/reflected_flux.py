@@ -248,13 +248,13 @@ def lattice_reflectance(model: BSSRDF, mu_i: float) -> tuple[float, float]:
     while not values or (len(values) < MOST_SHIFTS and error > ENOUGH * abs(np.mean(values))):
         shifts = [np.random.default_rng(len(values) + k).random(len(GENERATOR)) for k in range(SHIFTS)]
         query, weight = _points(POINTS, np.stack(shifts, axis=1), window, mu_i, model.medium.eta)
-        values += np.mean((_evaluated(model, query) * weight).reshape(SHIFTS, POINTS), axis=1).tolist()
+        values += np.mean((evaluated(model, query) * weight).reshape(SHIFTS, POINTS), axis=1).tolist()
         error = float(np.std(values, ddof=1)) / math.sqrt(len(values))
     return float(np.mean(values)), error
 
 
-def _evaluated(model: BSSRDF, query: Query) -> np.ndarray:
-    """S of a query, in the array library in which the model is fast."""
+def evaluated(model: BSSRDF, query: Query) -> np.ndarray:
+    """S of NumPy arrays in their precision, in the library that is fastest for the model; the result in double."""
     query = np.broadcast_arrays(*query)
     if model.fast_in == "drjit":
         Float = array_types().Float
@@ -298,7 +298,7 @@ def _window(model: BSSRDF, mu_i: float) -> tuple[float, float] | None:
     """ln r between which r² S carries flux; None where there is none."""
     r = float(model.medium.mfp) * np.logspace(-DECADES, DECADES, 2 * DECADES * PER_DECADE + 1)
     query, _ = _points(FEW, np.full((len(GENERATOR), 1), 0.3), (0.0, 1.0), mu_i, model.medium.eta)
-    mass = np.abs(_evaluated(model, (r[:, None], *query[1:]))).mean(axis=1) * r * r
+    mass = np.abs(evaluated(model, (r[:, None], *query[1:]))).mean(axis=1) * r * r
     alive = np.nonzero(mass > LEFT_OUT * mass.max())[0]
     if not len(alive):
         return None
