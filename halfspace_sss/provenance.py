@@ -121,9 +121,9 @@ def read_bytes(path: str | Path, most: int = LARGEST) -> bytes:
     return data
 
 
-def read_text(path: str | Path, most: int = LARGEST_TEXT) -> str:
+def read_text(path: str | Path) -> str:
     """The text of a file in UTF-8, without the mark that spreadsheets put first; OSError as `read_bytes`."""
-    return read_bytes(path, most).decode("utf-8-sig")
+    return read_bytes(path, LARGEST_TEXT).decode("utf-8-sig")
 
 
 def write_atomically(path: Path, content: bytes | str) -> None:

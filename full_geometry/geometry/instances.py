@@ -335,9 +335,9 @@ class InstanceScene:
         si.instance = hit.instance
         return completed(transform.interaction_to_world(si, flags), hit, ray, flags, active)
 
-    def transform(self, si: mi.SurfaceInteraction3f, active: mi.Bool | bool = True) -> InstanceTransform:
+    def transform(self, si: mi.SurfaceInteraction3f) -> InstanceTransform:
         """The transformation of the instance that a ray has met."""
-        return self._transform(looked_up(self.tables["row"], si.instance, 0, active), active)
+        return self._transform(looked_up(self.tables["row"], si.instance, 0), True)
 
     def _transform(self, row: mi.Int32, active: mi.Bool | bool) -> InstanceTransform:
         M, inverse = (self._columns(key, row, active) for key in ("to_world", "to_object"))

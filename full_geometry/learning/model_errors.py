@@ -313,12 +313,12 @@ class MeanRatio(NamedTuple):
     error: float
 
 
-def mean_ratios(scene: mi.Scene, image: np.ndarray, sensor: int = 0, seed: int = 0) -> list[MeanRatio]:
+def mean_ratios(scene: mi.Scene, image: np.ndarray, sensor: int = 0) -> list[MeanRatio]:
     """The ratio of each translucent object that enough places of the film show.
     `scene`: whose integrator tells mm_per_unit and max_depth. `image`: (height, width, channels) radiance by a model,
     of the whole crop. ValueError if the scene cannot be walked."""
     # ---- rays through random places of the film, and the objects they meet
-    camera, numbers = scene.sensors()[sensor], np.random.default_rng(seed)
+    camera, numbers = scene.sensors()[sensor], np.random.default_rng(0)
     place = numbers.random((2, WALKS), dtype=np.float32)
     ray, weight = camera.sample_ray(camera.shutter_open(), 0.5, mi.Point2f(*map(mi.Float, place)), mi.Point2f(0.5))
     si = scene.ray_intersect(ray)
@@ -327,7 +327,7 @@ def mean_ratios(scene: mi.Scene, image: np.ndarray, sensor: int = 0, seed: int =
     # ---- a walk each
     settings = scene.integrator().settings.shared()
     walks = mi.load_dict({"type": "translucent_walk", **settings})
-    L = weight * walks.sample(scene, independent(seed, WALKS), mi.Ray3f(ray))[0]
+    L = weight * walks.sample(scene, independent(0, WALKS), mi.Ray3f(ray))[0]
     walked = np.array(L).reshape(-1, WALKS)
 
     # ---- the image at these places

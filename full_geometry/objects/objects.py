@@ -284,11 +284,11 @@ class TranslucentObject:
             return self.spectral.at_exit(si)
         return () if self.textured is None else self.textured.at(si)
 
-    def knowing(self, at: SurfacePoint, face: mi.UInt32 | None = None, active: mi.Bool = True) -> SurfacePoint:
+    def knowing(self, at: SurfacePoint, face: mi.UInt32 | None = None) -> SurfacePoint:
         """A point of its surface with the medium there, where that has textures; a ray finds an unknown face."""
         if self.textured is None:
             return at
-        return at._replace(medium=self.textured.at_point(self.geometry, at.p, at.n, face, active))
+        return at._replace(medium=self.textured.at_point(self.geometry, at.p, at.n, face))
 
     @property
     def points(self) -> AreaPoints:

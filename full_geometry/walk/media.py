@@ -231,23 +231,15 @@ class HeterogeneousMedia:
         T = dr.full(mi.Spectrum, 1, dr.width(o))
         t = -dr.log(1 - rng.next_float32()) / M
 
-        def collide(
-            t: mi.Float,
-            T: mi.Spectrum,
-            rng: mi.PCG32,
-            o: mi.Point3f,
-            d: mi.Vector3f,
-            k: mi.Int32,
-            M: mi.Float,
-            distance: mi.Float,
-        ) -> tuple:
+        def collide(t: mi.Float, T: mi.Spectrum, rng: mi.PCG32) -> tuple:
             # T *= 1 - sigma_t / M at the collision, then the next one
             T = T * dr.maximum(1 - self.sigma_t(k, dr.fma(d, t, o)) / M, 0)
-            return t - dr.log(1 - rng.next_float32()) / M, T, rng, o, d, k, M, distance
+            return t - dr.log(1 - rng.next_float32()) / M, T, rng
 
-        state = (t, T, rng, o, d, k, M, mi.Float(distance))
-        going = lambda t, T, rng, o, d, k, M, distance: (t < distance) & (dr.max(T) > 0)  # noqa: E731
-        return dr.while_loop(state, going, collide, label="ratio tracking")[1]
+        def going(t: mi.Float, T: mi.Spectrum, rng: mi.PCG32) -> mi.Bool:
+            return (t < distance) & (dr.max(T) > 0)
+
+        return dr.while_loop((t, T, rng), going, collide, label="ratio tracking")[1]
 
 
 def per_channel(rows: list[float | np.ndarray], scale: float) -> list[mi.Float]:

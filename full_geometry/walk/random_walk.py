@@ -530,19 +530,14 @@ def walk_from(
     start: SurfacePoint,
     visitor: StartVisitor,
     seed: int | tuple[int, ...],
-    lanes: int = LANES,
-    roulette_from: int = ROULETTE_FROM,
 ) -> None:
     """Walk from points on object k until the walks leave it or end inside.
 
     Args:
         media: the translucent objects of a scene, see `WalkMedia.of`.
-        k: number of the object.
         start: p, n, n_out and w, arrays of one length; where w is below the surface, no walk enters.
         visitor: what is recorded. It has to end walks that leave.
         seed: one whole number or more.
-        lanes: walks at a time; another number gives other walks.
-        roulette_from: scattering events from which on roulette may end a walk.
 
     Raises:
         ValueError: there is no object k, its medium has textures and is not known at the start, or the arrays of
@@ -553,8 +548,8 @@ def walk_from(
     if n == 0:
         return
     evaluate(start)
-    lanes = min(lanes, n)
-    walker = Walker(media, visitor, roulette_from)
+    lanes = min(LANES, n)
+    walker = Walker(media, visitor, ROULETTE_FROM)
     total, step, k = (dr.opaque(mi.UInt32, v) for v in (n, lanes, k))  # kernels then serve any number of walks
 
     def renew(walk: Walk, index: mi.UInt32, record: Record) -> tuple[Walk, mi.UInt32, Record]:

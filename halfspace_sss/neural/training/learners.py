@@ -32,6 +32,7 @@ from halfspace_sss.physics.medium import Medium
 ENERGY_SHARE = 0.5  # of the queries of a batch follow the energy over u, the others are uniform in u
 TINY = 1e-30
 FLAT, STEEP = 1e-3, 8.0  # bounds of a slope
+MEDIUM_WIDTH = 64  # hidden units of the network of a medium, which has two hidden layers
 
 
 @dataclass(frozen=True)
@@ -203,11 +204,12 @@ class Small(nn.Module):
     """log(G/B) of one medium: `Network` as a torch module.
     `seed`: of the numbers at the start. `start`: network to start from instead."""
 
-    def __init__(self, width: int = 32, depth: int = 3, seed: int = 0, start: Network | None = None) -> None:
+    depth = 3
+
+    def __init__(self, width: int = 32, seed: int = 0, start: Network | None = None) -> None:
         super().__init__()
         self.width = width
-        self.depth = depth
-        self.shapes: list[tuple[int, int]] = layer_shapes(N_FEATURES, width, depth)
+        self.shapes: list[tuple[int, int]] = layer_shapes(N_FEATURES, width, self.depth)
         numbers = initial_numbers(self.shapes, torch.Generator().manual_seed(seed))
         if start is not None:
             pairs = zip(start.matrices, start.biases)
@@ -225,19 +227,15 @@ class Small(nn.Module):
 
 class Hyper(nn.Module):
     """log(G/B) of any medium: `Hypernetwork` as a torch module.
-    `width`, `depth`: hidden layers of the small network it writes. `rank`: number of coefficients of a medium.
-    `medium_width`: hidden units of the network of the medium, which has two hidden layers. `seed`: of the numbers at
-    the start."""
+    `rank`: number of coefficients of a medium. `seed`: of the numbers at the start."""
 
-    def __init__(
-        self, width: int = 32, depth: int = 3, rank: int = 48, medium_width: int = 64, seed: int = 0
-    ) -> None:  # fmt: skip
+    width, depth = 32, 3  # hidden layers of the small network it writes
+
+    def __init__(self, rank: int = 48, seed: int = 0) -> None:
         super().__init__()
         generator = torch.Generator().manual_seed(seed)
-        self.width = width
-        self.depth = depth
-        self.shapes: list[tuple[int, int]] = layer_shapes(N_FEATURES, width, depth)
-        sizes = [N_MEDIUM, medium_width, medium_width, rank]
+        self.shapes: list[tuple[int, int]] = layer_shapes(N_FEATURES, self.width, self.depth)
+        sizes = [N_MEDIUM, MEDIUM_WIDTH, MEDIUM_WIDTH, rank]
         self.matrices: nn.ParameterList = nn.ParameterList(
             torch.randn(i, j, generator=generator) / math.sqrt(i) for i, j in zip(sizes, sizes[1:])
         )
@@ -271,13 +269,14 @@ class PaperLearner(nn.Module):
     `medium`: scalar, in mean free paths. `scale`: S is divided by it, so that targets are of order one. `seed`: of the
     numbers at the start."""
 
-    def __init__(self, medium: Medium, scale: float, width: int = 256, depth: int = 3, seed: int = 0) -> None:
+    depth = 3
+
+    def __init__(self, medium: Medium, scale: float, width: int = 256, seed: int = 0) -> None:
         super().__init__()
         self.medium = medium
         self.scale = scale
         self.width = width
-        self.depth = depth
-        self.shapes: list[tuple[int, int]] = layer_shapes(N_INPUTS, width, depth)
+        self.shapes: list[tuple[int, int]] = layer_shapes(N_INPUTS, width, self.depth)
         self.numbers: nn.Parameter = nn.Parameter(initial_numbers(self.shapes, torch.Generator().manual_seed(seed)))
 
     def inputs(self, batch: Batch) -> torch.Tensor:

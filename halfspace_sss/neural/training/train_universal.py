@@ -181,10 +181,10 @@ def _batches(data: Fluxes, size: int) -> Callable[[torch.Generator], tuple[torch
     return batch
 
 
-def calibrated(data: Fluxes, how: Fit, seed: int, progress: NamedProgress | None = None) -> Layers:
+def calibrated(data: Fluxes, how: Fit, seed: int) -> Layers:
     """The layers that give the coefficients of log a of a medium, fitted to `data`; `n_groups` media a step."""
     learner = _Balance(seed)
-    fit(learner, _batches(data, how.n_groups), how, seed, progress=progress)
+    fit(learner, _batches(data, how.n_groups), how, seed)
     return learner.layers()
 
 
