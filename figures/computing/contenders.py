@@ -60,7 +60,6 @@ def ready(
     Args:
         method: a name in `VOLUMES`, `WALK`, or a model; `full_geometry` must have been trained.
         description: of the scene, with millimetres of its unit in the integrator; it is changed.
-        name: of the object in it.
         medium: of the object, 1/mm; of one that varies any with its mean cosine.
         bare: whether a model is left without surface reflection and without the single scattering that it lacks.
 

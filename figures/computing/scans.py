@@ -56,7 +56,6 @@ def scan_scene(
     """A translucent object on its own, as a dict for `scenes.scene_files.load_scene`, under its name.
 
     Args:
-        material: name in the registry.
         size: pixels of the square image.
         lights: "both" for the small light and dim surroundings with two windows, "small light", or "even sky",
             radiance 1 from everywhere.

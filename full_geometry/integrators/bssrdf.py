@@ -66,11 +66,7 @@ def _class(variant: str) -> type:
 
         Images can be differentiated by emitters, surfaces, textures and the medium of each object (`albedo`, `sigma_t`,
         `g`), forward and backward; where paths go is held, and derivatives by geometry are refused.
-
-        Args:
-            props: the parameters.
-            choose: says what stands for the model "auto" in a scene.
-        """
+        `choose`: says what stands for the model "auto" in a scene."""
 
         def __init__(self, props: mi.Properties, choose: Chooser) -> None:
             mi.SamplingIntegrator.__init__(self, props)
@@ -84,11 +80,7 @@ def _class(variant: str) -> type:
 
         def prepare(self, scene: mi.Scene, samples: int = 1) -> list[TranslucentObject]:
             """The translucent objects of a scene, made ready once; ValueError if the scene cannot be rendered.
-
-            Args:
-                scene: of Mitsuba.
-                samples: of an image, by which corrected light has its walks; 0 for the light that is known.
-            """
+            `samples`: of an image, by which corrected light has its walks; 0 for the light that is known."""
             with undisturbed(), dr.suspend_grad():
                 return self._checked(scene, samples)[0]
 

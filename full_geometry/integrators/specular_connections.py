@@ -69,15 +69,9 @@ def trial(
     sampler: mi.Sampler, active: mi.Bool,
 ) -> Connection:  # fmt: skip
     """A connection from the first guess or from a random direction.
-
-    Args:
-        obj: the object.
-        ends: the point inside and the target outside.
-        reflects: whether the ray is reflected once before it leaves; it then starts from any direction.
-        random: whether it starts from a random direction, about the guess where it does not reflect.
-        sampler: random numbers.
-        active: lanes that count.
-    """
+    `ends`: the point inside and the target outside. `reflects`: whether the ray is reflected once before it leaves; it
+    then starts from any direction. `random`: whether it starts from a random direction, about the guess where it does
+    not reflect."""
     # where the straight ray, or one of any direction, meets the boundary: its normal n
     (p, target), v, u = ends, sampler.next_1d(random), sampler.next_2d(random)
     toward, d = dr.normalize(target - p), mi.warp.square_to_uniform_sphere(u)
@@ -111,15 +105,8 @@ def connect(
     newton: tuple, active: mi.Bool,
 ) -> Connection:  # fmt: skip
     """A ray from p inside the object, reflected once or not, then refracted towards `target`; found from `start`.
-
-    Args:
-        obj: the object.
-        p, target: the ends.
-        start: the direction that Newton's method starts from.
-        reflects: where the ray is reflected; where it is False itself, code for that is left out.
-        newton: the number of steps, and the longest, radians.
-        active: lanes that count.
-    """
+    `p`, `target`: the ends. `reflects`: where the ray is reflected; where it is False itself, code for that is left
+    out. `newton`: the number of steps, and the longest, radians."""
     steps, longest = newton
 
     def step(k: mi.UInt32, d: mi.Vector3f, best: Connection, active: mi.Bool) -> tuple:

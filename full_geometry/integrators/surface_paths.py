@@ -111,7 +111,6 @@ def replay_paths(
 
     Args:
         sampler: as it was before the paths were traced.
-        ray: rays of the paths.
         L: radiance of the paths, in two parts.
         d: backward: adjoint of the radiance, which is handed on to the parameters of the scene.
         backward: otherwise the derivative of the radiance is returned, for the derivatives that the parameters carry.

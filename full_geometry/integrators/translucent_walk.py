@@ -125,11 +125,7 @@ def _class(variant: str) -> type:
             """Precompute light once for all calls of `sample`, until objects or emitters change.
 
             `filling` has the seconds that each image takes for it; media and cells are made once.
-
-            Args:
-                scene: of Mitsuba.
-                samples: of an image, by which the light has its rays.
-                seed: of the light.
+            `samples`: of an image, by which the light has its rays.
 
             Raises:
                 ValueError: light cannot be precomputed in this scene, and is asked for.
@@ -259,10 +255,7 @@ def _class(variant: str) -> type:
             spp: int = 0,
         ) -> tuple[mi.TensorXf, list[mi.TensorXf]]:  # fmt: skip
             """The image, and its derivative along each of the variables that media come from: all of the same paths.
-
-            Args:
-                variables: arrays with gradients enabled; all their numbers change alike.
-            """
+            `variables`: arrays with gradients enabled; all their numbers change alike."""
             with undisturbed(), dr.suspend_grad():
                 image, found = self._differentiable(scene, sensor, seed, spp), []
                 with dr.resume_grad():
@@ -435,10 +428,7 @@ def _launch(
 
 def _glints(tracer: PathTracer, sensor: mi.Sensor, trial: int) -> mi.UInt32:
     """Pixels in which emission seen in objects varies much more than other light.
-
-    Args:
-        trial: rays of each pixel that look for it.
-    """
+    `trial`: rays of each pixel that look for it."""
     width, height = (int(v) for v in sampled_size(sensor.film()))
     near, most = _near_mirrored(tracer, sensor), width * height // GLINTS
     pixels = aligned(mi.UInt32, np.arange(width * height, dtype=np.uint32))

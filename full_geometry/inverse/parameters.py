@@ -110,11 +110,7 @@ def size_bounds(shape: mi.Shape, mm_per_unit: float) -> tuple[float, float]:
 @dataclass(frozen=True, eq=False)
 class FitParameters:
     """The parameters of one object that are fitted.
-
-    Args:
-        names: of `NAMES`.
-        sizes: bounds of sigma_t, 1/mm.
-    """
+    `names`: of `NAMES`. `sizes`: bounds of sigma_t, 1/mm."""
 
     names: tuple[str, ...]
     shape: mi.Shape

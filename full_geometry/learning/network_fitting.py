@@ -244,14 +244,8 @@ STANDARD = Recipe()
 
 class ObjectFit:
     """The state of a fit, which follows from recipe, seed, number of steps, data and device, see `device_of_walks`.
-
-    Args:
-        n_in: features of a pair.
-        eta: relative index.
-        recipe: sizes and rates.
-        seed: of the initial weights and of the order of the data.
-        patches: of the surface, for whose weights a network is fitted beside; None for a shape without faces.
-    """
+    `n_in`: features of a pair. `patches`: of the surface, for whose weights a network is fitted beside; None for a
+    shape without faces."""
 
     def __init__(
         self, n_in: int, channels: int, eta: float, recipe: Recipe, seed: int, patches: Patches | None = None

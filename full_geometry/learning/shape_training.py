@@ -205,7 +205,6 @@ def train_shapes(
     Args:
         seconds: for data and fit, after the kernels are compiled.
         meshes: closed PLY files among the shapes.
-        recipe: sizes and rates.
         plan: numbers of objects and steps instead of a plan by time.
         work: folder for unfinished work: every object that was made, and the state of the fit.
         progress: called with (what, done, total).
@@ -419,9 +418,7 @@ class PairData:
     Args:
         walks: of walks that left at order two or more.
         T: their throughput over the mean of all walks.
-        proposals: of proposals.
         W: their S_0 mu_i over the density and the same mean.
-        medium: its numbers.
         share: of the walks that were begun which the first stand for.
     """
 
@@ -507,7 +504,6 @@ class GroupPart(NamedTuple):
         walks, proposals: descriptors (pairs, numbers).
         T: of walks, so that their sum is a sample of the mean over the whole object.
         W: of proposals.
-        medium: its numbers.
         share: of the mean of W in the mean over the whole object.
         light: B of the group.
         weight: w.

@@ -57,7 +57,6 @@ class Events:
     """Places of events of an object, sorted by their cell, and the grid about them.
 
     Args:
-        p: places.
         n: outward geometric normals where their rays entered.
         low: corner of the grid.
         h: its width, scene units.

@@ -104,8 +104,6 @@ class InsideCells:
         """The cells of object k.
 
         Args:
-            media: the objects.
-            k: number of the object.
             points: so many uniform over its surface for each square of a scene unit, part by part.
             box: its least and largest coordinates.
             h: edge of a cell, from `cell_edge`.

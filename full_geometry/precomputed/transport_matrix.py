@@ -251,11 +251,7 @@ class TransportMatrix:
 
     def beyond(self, L: np.ndarray, rays: Rays) -> np.ndarray:
         """What S along the directions of light brings beyond 1 + g.w, as `@` returns it.
-
-        Args:
-            L: mean of the radiance that comes along rays, (points, channels).
-            rays: to points.
-        """
+        `L`: mean of the radiance that comes along rays, (points, channels)."""
         # ---- S of a few pairs, along a direction w of light at the entry, over a(mu_i)
         lit = lit_pairs((self.t * np.take(L, self.entry, axis=0)).mean(axis=2), self.entry, rays)
         (S, mu), rows, point = self.pairs.S(lit), len(self.points), self.entry.ravel()[lit.number]

@@ -85,12 +85,7 @@ class UnscatteredLight:
 
     def light(self, media: WalkMedia, event: Event, last: mi.Bool | bool = False) -> tuple[mi.Spectrum, mi.Bool]:
         """Light that an event of a walk scatters on along it, per weight of the walk, and whether a cell holds it.
-
-        Args:
-            media: the objects.
-            event: of the walk.
-            last: whether scattered light counts too.
-        """
+        `last`: whether scattered light counts too."""
         # ---- find the cell of the event
         at = {key: dr.gather(type(t), t, media.place_of(event.object)) for key, t in self.tables.items()}
         x = mi.Point3f((event.p - at["low"]) * at["scale"])
@@ -125,15 +120,8 @@ def unscattered_light(
     scene: mi.Scene, media: WalkMedia, seed: int, cells: list[InsideCells], rays: int, paths: int = 0
 ) -> UnscatteredLight:
     """Unscattered light of the emitters of a scene.
-
-    Args:
-        scene: of Mitsuba.
-        media: its objects.
-        seed: whole number.
-        cells: of the objects, from `inside_cells_of`.
-        rays: of light, for each object.
-        paths: of scattered light, all objects together; 0 leaves that to walks.
-    """
+    `cells`: of the objects, from `inside_cells_of`. `rays`: of light, for each object. `paths`: of scattered light, all
+    objects together; 0 leaves that to walks."""
     # ---- trace light into the cells of each object, fit its fluence and directions, and put all into one table
     n = len(mi.Spectrum(0))
     directional = any(np.any(inside.medium.g) for inside in media.specs)

@@ -313,11 +313,7 @@ def _class(variant: str) -> type:
 
     class Translucent(mi.BSDF):
         """The reflection of the boundary as a BSDF; `spec` says what is below.
-
-        Args:
-            props: the parameters.
-            check_model: raises ValueError for the name of a model that does not exist.
-        """
+        `check_model`: raises ValueError for the name of a model that does not exist."""
 
         def __init__(self, props: mi.Properties, check_model: Callable[[str], None]) -> None:
             mi.BSDF.__init__(self, props)

@@ -198,11 +198,7 @@ class PairSource:
         """The pairs of walks whose ends and orders from one on are known, those of two and more, T as values.
 
         With t the mean over channels of T over its mean, a walk is kept with the chance p = min(1, t / 1.5), as T / p:
-        one of little T costs a step as much as another, and tells it less.
-
-        Args:
-            starts, exits: of the walks.
-        """
+        one of little T costs a step as much as another, and tells it less."""
         n, albedo = dr.width(starts.p), self._albedo_samples(starts, exits)
         T = dr.select(exits.order == 1, 0, exits.T)
         if self.scale is not None:

@@ -176,11 +176,7 @@ class Page:
 
 def view(scene: dict[str, Any] | str | Path, **options: object) -> Page:
     """Serve a scene to browsers, and in a notebook show it below the cell; `Page.close` ends it.
-
-    Args:
-        scene: the path of an XML file, or a dict as for `mitsuba.load_dict`.
-        options: as of `Page`.
-    """
+    `scene`: the path of an XML file, or a dict as for `mitsuba.load_dict`. `options`: as of `Page`."""
     return Page(scene, **options)
 
 

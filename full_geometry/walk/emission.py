@@ -46,14 +46,7 @@ def sample_emitter(
     scene: mi.Scene, at: mi.Interaction3f, u: mi.Point2f, active: mi.Bool, differentiable: bool = False
 ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
     """A direction to an emitter with its density p_e, and L_e / p_e, whatever lies between.
-
-    Args:
-        scene: the Mitsuba scene.
-        at: the point that the emitter is seen from.
-        u: uniform numbers.
-        active: lanes that count.
-        differentiable: whether the light carries derivatives by parameters of emitters, with the direction held.
-    """
+    `differentiable`: whether the light carries derivatives by parameters of emitters, with the direction held."""
     # w and p_e are held in derivatives, L_e is not
     with dr.suspend_grad():
         ds, light = scene.sample_emitter_direction(at, u, False, active)

@@ -72,14 +72,8 @@ class LightSubpath:
 @dataclass(frozen=True, eq=False)
 class SubpathConnections:
     """Connections of events with light subpaths of small emitters.
-
-    Args:
-        scene: the Mitsuba scene.
-        media: its translucent objects.
-        small: its small emitters.
-        share: probability of a light subpath at an event near the boundary.
-        scored: whether light comes with its slopes.
-    """
+    `share`: probability of a light subpath at an event near the boundary. `scored`: whether light comes with its
+    slopes."""
 
     scene: mi.Scene
     media: WalkMedia

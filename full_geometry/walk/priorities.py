@@ -62,13 +62,8 @@ class Priorities:
         groups: list[Group],
     ) -> Priorities | None:  # fmt: skip
         """The groups of a scene; None where nothing overlaps and nothing has a priority.
-
-        Args:
-            scene: of Mitsuba.
-            result: what lies inside of what, the smallest holder last.
-            holders: objects, then glass.
-            objects: that are translucent, by shape.
-            groups: that instances in the scene show.
+        `result`: what lies inside of what, the smallest holder last. `holders`: objects, then glass. `groups`: that
+        instances in the scene show.
 
         Raises:
             ValueError: a group has more than MOST things, an open one, glass that is no dielectric, or a delta light.

@@ -46,8 +46,6 @@ class StraightLight:
     """Emitters as events see them through boundaries of index 1.
 
     Args:
-        scene: the Mitsuba scene.
-        media: its translucent objects.
         emitters: those that are sampled.
         tables: `pointer`, what Dr.Jit's registry calls each of them, and from that number to its place, `index`.
         again: whether light may pass an object again on its way: not where walks carry their medium, nor where paths

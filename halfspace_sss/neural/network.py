@@ -47,13 +47,8 @@ def symmetric_features(lib: Library, r: Real, incoming: Ray, outgoing: Ray, L: R
     With (x, y, mu') of both rays: u/4 where u = log(exp(r/L) - 1); x_i + x_o; mu_i' + mu_o' - 1; (x_i - x_o)²;
     (mu_i' - mu_o')²; (x_i - x_o)(mu_i' - mu_o'); y_i y_o; and for depths s of 0.25, 1 and 4 mean free paths and L the
     logarithm of the distance between the points s along both refracted rays over sqrt(r² + s²).
-
-    Args:
-        lib: array library of the query.
-        r: distance in mean free paths.
-        incoming, outgoing: from `travel`.
-        L: length scale of the medium in mean free paths.
-    """
+    `r`: distance in mean free paths. `incoming`, `outgoing`: from `travel`. `L`: length scale of the medium in mean
+    free paths."""
     (x_i, y_i, mu_i), (x_o, y_o, mu_o) = incoming, outgoing
     x, y, mu = x_i + x_o, y_i + y_o, mu_i - mu_o
     d = x_i - x_o

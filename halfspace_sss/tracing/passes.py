@@ -315,7 +315,6 @@ def walk_passes(
         medium: scalar medium, or what `trace` walks in.
         mu_i: cosine of incidence outside, [0, 1], or "diffuse".
         seed: whole numbers that name this run; each pass has a stream of its own.
-        tallies: makes the tallies of a pass.
         progress: called with (passes done, passes in all).
         trace: the walk in the medium, with the arguments of `walk`.
     """
