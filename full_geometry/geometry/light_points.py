@@ -151,7 +151,7 @@ class SurfacePoints:
     def some(self, kept: np.ndarray) -> SurfacePoints:
         """Those of these numbers."""
         index = aligned(mi.UInt32, kept)
-        p, n, n_out, face = (dr.gather(type(v), v, index) for v in (self.p, self.n, self.n_out, self.face))
+        p, n, n_out, face = dr.gather(tuple, (self.p, self.n, self.n_out, self.face), index)
         dr.eval(p, n, n_out, face)
         return SurfacePoints(p, n, n_out, face, *_grid(np.array(p, dtype=float).T, self.h))
 
@@ -225,7 +225,7 @@ class SurfacePoints:
             h, low, begin = opaque(self.h), [opaque(v) for v in self.low], None
             counts = [dr.opaque(mi.Int32, int(c)) for c in self.cells]
         else:
-            h, low, counts, begin = (dr.gather(type(table), table, k, active) for table in self.tables)
+            h, low, counts, begin = dr.gather(tuple, self.tables, k, active)
         cell = [mi.Int32(dr.floor((p[a] - low[a]) / h)) for a in range(3)]
         valid = active
         for index, count in zip(cell, counts):

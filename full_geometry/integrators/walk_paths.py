@@ -942,7 +942,7 @@ class FirstExits:
 
     def gather(self, lanes: mi.UInt32) -> FirstExits:
         """The paths of the given lanes."""
-        return FirstExits(**{name: dr.gather(type(value), value, lanes) for name, value in vars(self).items()})
+        return dr.gather(FirstExits, self, lanes)
 
 
 @dataclass

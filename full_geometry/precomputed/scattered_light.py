@@ -32,6 +32,7 @@ from full_geometry.walk.random_walk import (
     PATH_LANES,
     Crossing,
     Event,
+    Visitor,
     Walk,
     Walker,
     draw_channel,
@@ -60,7 +61,7 @@ class LightPath:
 
 
 @dataclass(frozen=True, eq=False)
-class ScatteredLight:
+class ScatteredLight(Visitor):
     """Paths from emitters that add ∫ L_s x_j dx dw to cells at their events.
     `scene`, `media`: of Mitsuba, and its objects. `index`: of the cells of all objects. `tables`: by the number of an
     object, as of `UnscatteredLight`. `D`: of each slot and channel ∫ L_s (1, x, y, z) dx dw, x from the centre of the
@@ -98,7 +99,7 @@ class ScatteredLight:
         first, step = (dr.opaque(type(ends), v) for v in (float(u[0]), total / number))
         at = (dr.arange(type(ends), number) + first) * step
         which = dr.binary_search(0, many - 1, lambda i: dr.gather(type(ends), ends, i) < at)
-        o, d, off, enters, flux, size = (dr.gather(type(v), v, which) for v in (o, d, off, enters, flux, size))
+        o, d, off, enters, flux, size = dr.gather(tuple, (o, d, off, enters, flux, size), which)
         flux = dr.select(size > 0, flux * (opaque(total / (number * parts)) / dr.maximum(size, 1e-30)), 0)
         return o, d, off, dr.select(enters, mi.Int32(k), OUTSIDE), size > 0, LightPath(flux, enters)
 
@@ -112,7 +113,7 @@ class ScatteredLight:
 
         def begin(index: mi.UInt32, rng: mi.PCG32) -> tuple[Walk, LightPath]:
             known = index < total
-            o, d, off, k, alive, path = (dr.gather(type(v), v, index, known) for v in starts)
+            o, d, off, k, alive, path = dr.gather(tuple, starts, index, known)
             channel, density = draw_channel(self.media.shares(dr.maximum(k, 0)), rng.next_float32())
             walk = replace(start_walk(o, d, rng), off=off, object=k, alive=alive & known)
             return replace(walk, channel=channel, density=density), path
@@ -154,7 +155,7 @@ class ScatteredLight:
 
     def event(self, walk: Walk, path: LightPath, event: Event) -> tuple[Walk, LightPath]:
         """Add what arrives."""
-        at = {key: dr.gather(type(t), t, self.media.place_of(event.object)) for key, t in self.tables.items()}
+        at = dr.gather(dict, self.tables, self.media.place_of(event.object))
         x = mi.Point3f((event.p - at["low"]) * at["scale"])
         slot, y, _, held = self.index.find(x, at["first"], at["counts"], ~path.direct | (walk.order > 0))
         # refraction by the camera's paths has 1 / scale, flux has not
@@ -162,16 +163,6 @@ class ScatteredLight:
         n = len(light)
         for c in range(n):
             dr.scatter_add(self.D, mi.Vector4f(1, y.x, y.y, y.z) * light[c], mi.UInt32(slot * n + c), held)
-        return walk, path
-
-    def boundary(
-        self, walk: Walk, path: LightPath, si: mi.SurfaceInteraction3f, active: mi.Bool
-    ) -> tuple[Walk, LightPath]:
-        return walk, path
-
-    def surface(
-        self, walk: Walk, path: LightPath, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32
-    ) -> tuple[Walk, LightPath]:
         return walk, path
 
     def crossing(self, walk: Walk, path: LightPath, crossing: Crossing) -> tuple[Walk, LightPath]:

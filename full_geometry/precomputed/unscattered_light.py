@@ -87,7 +87,7 @@ class UnscatteredLight:
         """Light that an event of a walk scatters on along it, per weight of the walk, and whether a cell holds it.
         `last`: whether scattered light counts too."""
         # ---- find the cell of the event
-        at = {key: dr.gather(type(t), t, media.place_of(event.object)) for key, t in self.tables.items()}
+        at = dr.gather(dict, self.tables, media.place_of(event.object))
         x = mi.Point3f((event.p - at["low"]) * at["scale"])
         slot, y, inverse, held = self.index.find(x, at["first"], at["counts"])
 

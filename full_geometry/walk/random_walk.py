@@ -200,28 +200,34 @@ class Crossing:
 
 
 class Visitor(Protocol):
-    """What is recorded of a walk. Each method returns the walk, whose random numbers it may use up, and its record."""
+    """What is recorded of a walk. Each method returns the walk, whose random numbers it may use up, and its record: as
+    they are where nothing is to be done."""
 
     def event(self, walk: Walk, record: Record, event: Event) -> tuple[Walk, Record]:
         """At a scattering event, after `walk.order` others; it may end the walk."""
+        return walk, record
 
     def boundary(self, walk: Walk, record: Record, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[Walk, Record]:
         """At the boundary from inside, where the walk may leave if `active`."""
+        return walk, record
 
     def surface(
         self, walk: Walk, record: Record, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32
     ) -> tuple[Walk, Record]:
         """At a surface inside an object: that of object k, or of something else if k < 0."""
+        return walk, record
 
     def crossing(self, walk: Walk, record: Record, crossing: Crossing) -> tuple[Walk, Record]:
         """After reflection at the boundary or refraction through it; `walk` is on its way again."""
+        return walk, record
 
 
 class StartVisitor(Visitor, Protocol):
     """One of walks from given points."""
 
     def begun(self, index: mi.UInt32) -> Record:
-        """The record of the walks with these numbers, at their starts."""
+        """The record of the walks with these numbers, at their starts; the numbers by default."""
+        return index
 
 
 @dataclass(frozen=True, eq=False)
@@ -469,7 +475,7 @@ class WalkExits(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class ExitVisitor:
+class ExitVisitor(StartVisitor):
     """Stores each exit at the number of its walk, which is its record, and ends the walk there.
     `exits`: where they are stored. `fewest`, `most`: orders that are kept."""
 
@@ -484,22 +490,6 @@ class ExitVisitor:
         exits = WalkExits(at, dr.zeros(mi.Spectrum, n), dr.zeros(mi.UInt32, n), dr.zeros(mi.UInt32, n))
         evaluate(exits)
         return cls(exits, *(dr.opaque(mi.UInt32, order) for order in (fewest, most)))
-
-    def begun(self, index: mi.UInt32) -> mi.UInt32:
-        return index
-
-    def event(self, walk: Walk, record: mi.UInt32, event: Event) -> tuple[Walk, mi.UInt32]:
-        return walk, record
-
-    def boundary(
-        self, walk: Walk, record: mi.UInt32, si: mi.SurfaceInteraction3f, active: mi.Bool
-    ) -> tuple[Walk, mi.UInt32]:
-        return walk, record
-
-    def surface(
-        self, walk: Walk, record: mi.UInt32, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32
-    ) -> tuple[Walk, mi.UInt32]:
-        return walk, record
 
     def crossing(self, walk: Walk, record: mi.UInt32, crossing: Crossing) -> tuple[Walk, mi.UInt32]:
         # x_i and w_i of a walk that leaves, with its throughput; the walk ends

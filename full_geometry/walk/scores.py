@@ -24,7 +24,7 @@ import numpy as np
 
 from full_geometry.surface.wrapped import surface_of
 from full_geometry.walk.media import Place, WalkMedia
-from full_geometry.walk.random_walk import ExitVisitor, WalkExits, walk_from
+from full_geometry.walk.random_walk import ExitVisitor, StartVisitor, WalkExits, walk_from
 
 if TYPE_CHECKING:
     from full_geometry.geometry.points import SurfacePoint
@@ -158,15 +158,9 @@ class KeptStays:
         # the last slot counts for all stays from there on
         for slot in range(SLOTS):
             at = dr.arange(mi.UInt32, self.paths) + slot * self.paths
-            number, place, p, q = (_gathered(v, at) for v in (self.number, self.place, self.p, self.q))
+            number, place, p, q = (dr.gather(type(v), v, at) for v in (self.number, self.place, self.p, self.q))
             slopes = p + q * L
             yield number, place, slopes * mi.Float(self.left) if slot == SLOTS - 1 else slopes
-
-
-def _gathered(values: Any, at: mi.UInt32) -> Any:
-    if dr.is_array_v(values):
-        return dr.gather(type(values), values, at)
-    return type(values)(*(dr.gather(type(v), v, at) for v in vars(values).values()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,7 +213,7 @@ class PathScores:
     def slopes(self, row: int, L: mi.Spectrum) -> Score:
         """The slopes p + q L of the light L of all paths, in one object."""
         at = dr.arange(mi.UInt32, self.paths) + row * self.paths
-        return _gathered(self.p, at) + _gathered(self.q, at) * L
+        return dr.gather(Score, self.p, at) + dr.gather(Score, self.q, at) * L
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,7 +281,7 @@ class ScoredWalk:
 
 
 @dataclass(frozen=True, eq=False)
-class ScoredExitVisitor:
+class ScoredExitVisitor(StartVisitor):
     """Stores exits, and the score of each walk at its exit; of objects with nothing inside and without textures.
     `exits`: stores them without scores. `media`: the objects. `scores`: where those of the exits are stored."""
 
@@ -305,11 +299,6 @@ class ScoredExitVisitor:
         self, walk: Walk, record: ScoredWalk, si: mi.SurfaceInteraction3f, active: mi.Bool
     ) -> tuple[Walk, ScoredWalk]:
         return walk, replace(record, stay=record.stay.flown(walk, si.p, self.media))
-
-    def surface(
-        self, walk: Walk, record: ScoredWalk, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32
-    ) -> tuple[Walk, ScoredWalk]:
-        return walk, record
 
     def crossing(self, walk: Walk, record: ScoredWalk, crossing: Crossing) -> tuple[Walk, ScoredWalk]:
         # n, d and d log p / dg of the walk, at the number of its exit
