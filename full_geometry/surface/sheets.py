@@ -290,11 +290,6 @@ def _class(variant: str) -> type:
             ahead = shares[TRANSMITTED] / dr.maximum(scattered, 1e-10)
             return dr.select(active, scattered * self.sheet.pdf(si, wo, ahead), 0)
 
-        def eval_pdf(
-            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-        ) -> tuple[mi.Spectrum, mi.Float]:
-            return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
-
         def eval_diffuse_reflectance(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
             return sum(self.sheet.scattered(si, active)) & active
 

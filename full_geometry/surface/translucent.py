@@ -147,11 +147,6 @@ def _boundary_class(variant: str) -> type:
         ) -> mi.Float:
             return mi.Float(0)
 
-        def eval_pdf(
-            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-        ) -> tuple[mi.Spectrum, mi.Float]:
-            return mi.Spectrum(0), mi.Float(0)
-
         def to_string(self) -> str:
             return f"SmoothBoundary[eta = {float(np.max(np.array(self.eta))):.7g}]"
 
@@ -185,11 +180,10 @@ def with_index(boundary: mi.BSDF, eta: float) -> mi.BSDF:
     Raises:
         ValueError: the boundary is tinted.
     """
-    if is_smooth_boundary(boundary):
-        return boundary if abs(float(np.max(np.array(boundary.eta))) - eta) < 1e-6 * eta else smooth_boundary(eta)
-    parameters = mi.traverse(boundary)
-    if abs(float(np.max(np.array(parameters["eta"]))) - eta) < 1e-6 * eta:
+    if abs(index_of(boundary) - eta) < 1e-6 * eta:
         return boundary
+    if is_smooth_boundary(boundary):
+        return smooth_boundary(eta)
     alpha = {key: value for key, value in held(boundary) if key != "eta"}
     if not alpha.keys() <= {"alpha", "alpha_u", "alpha_v"}:
         raise ValueError(f"the boundary of what overlaps must be without tints, got {', '.join(sorted(alpha))}")
@@ -199,10 +193,15 @@ def with_index(boundary: mi.BSDF, eta: float) -> mi.BSDF:
     return mi.load_dict({"type": "roughdielectric", "distribution": kind, "int_ior": eta, "ext_ior": 1.0, **alpha})
 
 
+def index_of(boundary: mi.BSDF) -> float | None:
+    """The relative index of a boundary; None of what has none."""
+    eta = mi.traverse(boundary).get("eta")
+    return None if eta is None else float(np.max(np.array(eta)))
+
+
 def check_eta(boundary: mi.BSDF, eta: float) -> None:
     """Refuse a boundary of another index than the medium's."""
-    result = mi.traverse(boundary).get("eta")
-    result = None if result is None else float(np.max(np.array(result)))
+    result = index_of(boundary)
     if result is None or abs(result - eta) > 2e-3 * eta:
         raise ValueError(
             f"the boundary must be a dielectric with eta {eta:g} of the medium (int_ior/ext_ior), got {result}"
@@ -372,11 +371,6 @@ def _class(variant: str) -> type:
             self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
         ) -> mi.Float:
             return self._shown(ctx, self.reflection.pdf(ctx, si, wo, active))
-
-        def eval_pdf(
-            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
-        ) -> tuple[mi.Spectrum, mi.Float]:
-            return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
 
         def eval_diffuse_reflectance(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
             """The directional albedo of the half-space of the medium here, towards the viewer.

@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from full_geometry.geometry.instances import Group, InstanceTable, shapes_of
 from full_geometry.geometry.shape import Geometry, name_of, pointer_numbers
 from full_geometry.objects.inclusions import Inclusion
-from full_geometry.surface.translucent import DIELECTRICS, boundary_of, is_smooth_boundary, with_index
+from full_geometry.surface.translucent import DIELECTRICS, boundary_of, index_of, with_index
 from full_geometry.surface.wrapped import surface_of
 
 OUTSIDE = -1  # of all objects
@@ -89,7 +89,7 @@ class Priorities:
             follows = own[k] is None and inside[k]
             around = inside[k][-1] if follows else None
             priority[k] = priority[around] if follows else own[k] or 0.0
-            eta[k] = _index(boundaries[k]) * (eta[around] if follows else 1.0)
+            eta[k] = index_of(boundaries[k]) * (eta[around] if follows else 1.0)
         listed = {id(shape): place for place, shape in enumerate(shapes_of(scene, groups))}
         order = {k: (priority[k], len(inside[k]), listed[id(holders.shapes[kind])], k)
                  for k, kind in enumerate(holders.kind)}  # fmt: skip
@@ -158,11 +158,7 @@ def _boundary(shape: mi.Shape) -> mi.BSDF:
             f"what overlaps an object must be a dielectric or roughdielectric, got the {bsdf.class_name()} of the "
             f"shape {name_of(shape)}"
         )
-    return boundary_of([bsdf], float(np.max(np.array(mi.traverse(bsdf)["eta"]))))
-
-
-def _index(boundary: mi.BSDF) -> float:
-    return float(np.max(np.array(boundary.eta if is_smooth_boundary(boundary) else mi.traverse(boundary)["eta"])))
+    return boundary_of([bsdf], index_of(bsdf))
 
 
 def _check(result: list[Inclusion], holders: InstanceTable, members: list[list[int]], objects: list[Geometry]) -> None:
