@@ -16,6 +16,7 @@ import numpy as np
 
 from full_geometry.geometry.points import opaque, place, wrapped
 from full_geometry.geometry.rounding import ray_from
+from full_geometry.geometry.sensors import independent
 from full_geometry.integrators.ballistic_and_single import OneEventWalk, light_at_events
 from full_geometry.integrators.lighting import Primal, RenderContext
 from full_geometry.precomputed.inner import Events, InnerLight, bands
@@ -47,9 +48,8 @@ def inner_light(
     n = 1 if sky is None or "Constant" in sky.class_name() else UNEVEN
     lane, turn = dr.arange(mi.UInt32, n * count), np.random.default_rng(SEED + k).random(4)
     event = lane // dr.opaque(mi.UInt32, n)
-    at = tuple(dr.gather(type(v), v, event) for v in (events.p, events.n))
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(SEED + k, n * count)
+    at = dr.gather(tuple, (events.p, events.n), event)
+    sampler = independent(SEED + k, n * count)
 
     # ---- light at events by connections and along directions; neighbours take both from one lattice each
     steps = [mi.Float(lane * int(2**32 * r)) * 2**-32 for r in R_2]

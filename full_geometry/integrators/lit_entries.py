@@ -21,6 +21,7 @@ import numpy as np
 
 from full_geometry.geometry.light_points import SurfacePoints, uniform_entries
 from full_geometry.geometry.points import AreaPoints
+from full_geometry.geometry.sensors import independent
 from full_geometry.geometry.shape import Geometry
 from full_geometry.geometry.snapshot import Snapshot, same_objects
 from full_geometry.integrators.gathering import GatheringPoint, by_emitters, light_state, met_by_cosine, spreads
@@ -103,8 +104,7 @@ def _brought(context: RenderContext, obj: TranslucentObject, count: int) -> tupl
     """Faces of uniform points, and the square of what a direction at them brings for a unit of S, mean of channels.
     Half of the mean square over emitter samples and directions by the cosine: a factor of all is of no account."""
     # uniform points of the surface
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(SEED, count)
+    sampler = independent(SEED, count)
     entry = uniform_entries(obj.geometry, sampler.next_1d(), sampler.next_2d())
     at = GatheringPoint(entry.p, entry.n, entry.n_out, obj.geometry.clearance)
 

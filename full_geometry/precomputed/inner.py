@@ -24,6 +24,7 @@ from scipy.sparse import csc_array, csr_array
 from full_geometry.geometry.light_points import lattice, uniform_entries
 from full_geometry.geometry.points import cosine_above, floats, opaque, place, refract_in, surface_point
 from full_geometry.geometry.rounding import ray_from
+from full_geometry.geometry.sensors import independent
 from halfspace_sss.arrays import aligned
 
 if TYPE_CHECKING:
@@ -141,8 +142,7 @@ def _places(obj: TranslucentObject, count: int) -> tuple[mi.Point3f, mi.Normal3f
     u = lattice(count)
     order = np.argsort(u[0])  # by faces: rays of neighbours meet the same part of the surface
     u = [floats(v[order]) for v in u]
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(11, count)
+    sampler = independent(11, count)
 
     # rays that enter uniformly over the surface, by the cosine, refracted inwards
     entry = uniform_entries(obj.geometry, u[0], mi.Point2f(u[1], u[2]))
