@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
-
-import numpy as np
 
 from halfspace_sss.arrays import Library, Real
 from halfspace_sss.checks import check_choice
@@ -37,13 +34,6 @@ class DiffuseBoundary:
             return DiffuseBoundary(fresnel.C_phi(eta), fresnel.C_E(eta), 4 * fresnel.C_phi(1 / eta))
         two_C_1, three_C_2 = fresnel.published_polynomial_2C_1, fresnel.published_polynomial_3C_2
         return DiffuseBoundary((1 - two_C_1(eta)) / 4, (1 - three_C_2(eta)) / 2, 1 - two_C_1(1 / eta))
-
-
-@functools.cache
-def unit_gauss(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes and weights of the Gauss-Legendre rule on [0, 1]."""
-    x, w = np.polynomial.legendre.leggauss(n)
-    return 0.5 * (x + 1), 0.5 * w
 
 
 class Grosjean:

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analytic_models._diffusion import unit_gauss
 from halfspace_sss.arrays import Library, Real, library
 from halfspace_sss.checks import check_choice
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.interface.query import Query
 from halfspace_sss.physics.fresnel import boundary_A, sine
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.physics.reflectance import unit_gauss
 
 R_MIN, MU_MIN = 1e-6, 1e-3  # mean free paths; refracted cosine
 VIRTUAL_SOURCES = ("classical", "grosjean", "directional")

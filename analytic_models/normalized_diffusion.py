@@ -7,12 +7,12 @@ import math
 
 import numpy as np
 
-from analytic_models._diffusion import unit_gauss
 from halfspace_sss.arrays import Real, library
 from halfspace_sss.interface.model import Separable, exit_normaliser
 from halfspace_sss.interface.query import Query
 from halfspace_sss.physics.fresnel import C_1
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.physics.reflectance import unit_gauss
 
 R_MIN = 1e-6  # mean free paths
 

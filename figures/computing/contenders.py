@@ -96,9 +96,14 @@ def _volume_scene(description: SceneDict, name: str, medium: Medium, rr_depth: i
 def long_walk(task: Task) -> dict[str, object]:
     """A long image by our walk, in passes that survive an interruption: what the other images are compared with.
     The parameters of the task are material, size, lights, spp, seed and, unless it is the bunny, scan."""
+    return long_passes(task, _walked(task))
+
+
+def _walked(task: Task) -> mi.Scene:
+    """The scene of a scanned object by our walk, made ready."""
     prepare()
     p = task.params
-    return long_passes(task, contender(WALK, p["material"], p["size"], p["lights"], scan=p.get("scan", "bunny")))
+    return contender(WALK, p["material"], p["size"], p["lights"], scan=p.get("scan", "bunny"))
 
 
 def long_passes(task: Task, scene: mi.Scene) -> dict[str, object]:
@@ -143,9 +148,7 @@ def reference_image(task: Task, scene: mi.Scene, alone: mi.Scene | None = None) 
 
 def long_reference(task: Task) -> dict[str, object]:
     """`reference_image` of a scanned object; the parameters are material, size, lights, spp, seed and any scan."""
-    prepare()
-    p = task.params
-    return reference_image(task, contender(WALK, p["material"], p["size"], p["lights"], scan=p.get("scan", "bunny")))
+    return reference_image(task, _walked(task))
 
 
 def _apart(image: np.ndarray, first: np.ndarray, second: np.ndarray, mask: np.ndarray) -> float:

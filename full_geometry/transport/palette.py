@@ -44,6 +44,7 @@ from full_geometry.settings import Settings
 from full_geometry.surface.spectral import MediumByWavelength
 from full_geometry.surface.textured import MediumAt, Number, TexturedMedium, bend, x_of_albedo
 from full_geometry.transport.half_space import HalfSpaceProposals, positions_of
+from full_geometry.walk.random_walk import pick
 from halfspace_sss import measure
 from halfspace_sss.arrays import broadcast_query
 from halfspace_sss.interface.model import BSSRDF
@@ -211,7 +212,7 @@ class Palette:
         def step(k: mi.UInt32, result: mi.Spectrum, slopes: list[Slope]) -> tuple[mi.UInt32, mi.Spectrum, list[Slope]]:
             c, first = k % n, k < n
             albedo, sigma_t = (
-                dr.select(first, _pick(getattr(ends[0], key), c), _pick(getattr(ends[-1], key), c)) for key in SLOPED
+                dr.select(first, pick(getattr(ends[0], key), c), pick(getattr(ends[-1], key), c)) for key in SLOPED
             )
             per_step, numbers = dr.gather(mi.Float, tables[3], c), [dr.gather(mi.Float, table, c) for table in tables]
             albedo = dr.clip(albedo, 0, 1)
@@ -336,7 +337,7 @@ class Palette:
         dr.make_opaque(firsts)
 
         def step(k: mi.UInt32, phi: list[list[mi.Float]]) -> tuple[mi.UInt32, list[list[mi.Float]]]:
-            q = replace(across, r=_pick([r for _, r in places], k))
+            q = replace(across, r=pick([r for _, r in places], k))
             new = self._functions(q, dr.gather(mi.UInt32, firsts, k))
             return k + 1, [[dr.select(k == j, a, b) for a, b in zip(new, old)] for j, old in enumerate(phi)]
 
@@ -392,13 +393,6 @@ def _log(S: mi.Float) -> mi.Float:
 
 def _v(albedo: mi.Float, g: mi.Float, bent: mi.Float) -> mi.Float:
     return dr.sqrt(x_of_albedo(dr, albedo, g, bent))
-
-
-def _pick(values: mi.Spectrum, c: mi.UInt32) -> mi.Float:
-    value = values[0]
-    for k in range(1, len(values)):
-        value = dr.select(c == k, values[k], value)
-    return value
 
 
 def _albedo_of_v(v: Number, g: Number, c: Number) -> Number:

@@ -330,15 +330,16 @@ def _nodes(n: int, eta: float) -> tuple[np.ndarray, np.ndarray]:
     Below a small c there are few: all others would be too few for the polynomials of highest order, which are then not
     orthogonal on the nodes."""
     if eta <= 1:
-        return _gauss(n)
+        return unit_gauss(n)
     c = math.sqrt((eta - 1) * (eta + 1)) / eta
     below = max(n // 8, round(n * min(c, 0.5)))
-    (t, w), (T, W) = _gauss(below), _gauss(n - below)
+    (t, w), (T, W) = unit_gauss(below), unit_gauss(n - below)
     return np.concatenate([c * (1 - t * t), c + (1 - c) * T * T]), np.concatenate([c * 2 * t * w, (1 - c) * 2 * T * W])
 
 
-def _gauss(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points and weights on [0, 1]."""
+@functools.cache
+def unit_gauss(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points and weights of the Gauss-Legendre rule on [0, 1]."""
     x, w = np.polynomial.legendre.leggauss(n)
     return 0.5 * (x + 1), 0.5 * w
 

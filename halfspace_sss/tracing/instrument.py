@@ -21,7 +21,7 @@ from halfspace_sss.arrays import Lanes, aligned
 from halfspace_sss.checks import check_edges, check_finite, check_interval
 from halfspace_sss.lazy import LazyModule
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.tracing.passes import CellSums, Estimate, Pass, estimate, find_cell
+from halfspace_sss.tracing.passes import CellSums, Estimate, Pass, estimate, find_cell, ratio_estimate
 from halfspace_sss.tracing.walk import Boundary, Scatter, Tally
 
 dr = LazyModule("drjit")
@@ -336,11 +336,7 @@ class Readings:
     def mean_depth(self) -> Estimate:
         """Mean of the largest depth that the light that leaves has reached, mm."""
         depth, flux = self._asked("depths by lane")[:, :2].T
-        if not flux.mean() > 0:
-            return Estimate(math.nan, math.nan)
-        mean = depth.mean() / flux.mean()
-        error = (depth - mean * flux).std(ddof=1) / (math.sqrt(len(flux)) * flux.mean())
-        return Estimate(float(mean * self.medium.mfp), float(error * self.medium.mfp))
+        return ratio_estimate(depth, flux, self.medium.mfp)
 
     def collected(self) -> Estimate:
         """Fraction of incident flux on each of `detectors` within its aperture."""

@@ -238,6 +238,15 @@ def estimate(samples: np.ndarray) -> Estimate:
     return Estimate(float(value), float(error)) if samples.ndim == 1 else Estimate(value, error)
 
 
+def ratio_estimate(moment: np.ndarray, flux: np.ndarray, unit: float) -> Estimate:
+    """The mean of a moment over that of the flux, of independent samples, times a unit; NaN without flux."""
+    if not flux.mean() > 0:
+        return Estimate(math.nan, math.nan)
+    ratio = moment.mean() / flux.mean()
+    error = (moment - ratio * flux).std(ddof=1) / (math.sqrt(len(flux)) * flux.mean())
+    return Estimate(float(unit * ratio), float(unit * error))
+
+
 def order_sum(order: str, single: np.ndarray, multiple: np.ndarray) -> np.ndarray:
     """What was recorded of an order, "single", "multiple" or their "total"."""
     check_choice("order", order, ORDERS)

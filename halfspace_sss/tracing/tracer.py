@@ -29,6 +29,7 @@ from halfspace_sss.tracing.passes import (
     checked_radii,
     estimate,
     order_sum,
+    ratio_estimate,
     walk_passes,
 )
 from halfspace_sss.tracing.walk import Tally, walk
@@ -76,13 +77,8 @@ class Trace:
         return estimate(order_sum(order, *self._pair(0)))
 
     def _ratio(self, order: str, column: int, unit: float) -> Estimate:
-        flux = order_sum(order, *self._pair(0))
-        moment = order_sum(order, *self._pair(column))
-        if not flux.mean() > 0:
-            return Estimate(math.nan, math.nan)
-        ratio = moment.mean() / flux.mean()
-        error = (moment - ratio * flux).std(ddof=1) / (math.sqrt(len(flux)) * flux.mean())
-        return Estimate(float(unit * ratio), float(unit * error))
+        moment, flux = (order_sum(order, *self._pair(each)) for each in (column, 0))
+        return ratio_estimate(moment, flux, unit)
 
     def mean_r2(self, order: str = "total") -> Estimate:
         """Mean squared distance between entry and exit, weighted by exitant flux, mm²."""

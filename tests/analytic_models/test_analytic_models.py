@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from analytic_models._diffusion import DiffuseBoundary, Grosjean, unit_gauss
+from analytic_models._diffusion import DiffuseBoundary, Grosjean
 from analytic_models.better_dipole import BetterDipole
 from analytic_models.directional_dipole import DirectionalDipole
 from analytic_models.forward_scattering_dipole import ForwardScatteringDipole, Monopole
@@ -22,6 +22,7 @@ from halfspace_sss.interface.query import Query
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.fresnel import F_r, F_t, boundary_A, boundary_A_jensen
 from halfspace_sss.physics.medium import eval_hg
+from halfspace_sss.physics.reflectance import unit_gauss
 
 LIB = library(0.0)
 MEDIA = [
