@@ -348,7 +348,8 @@ class LightVisitor:
         before = record
         record = replace(record, previous=crossing.si.p, pdf=crossing.pdf, delta=crossing.delta)
         if self.unscattered is not None:  # `emitter_behind` knows no reflections
-            record = replace(record, precomputed=record.precomputed & (crossing.leaves | (walk.order > 0)))
+            reflected = crossing.reflected(self.media, walk.d) & (walk.order > 0)
+            record = replace(record, precomputed=record.precomputed & (crossing.leaves | reflected))
         if self.forward:
             record = replace(record, run=record.run.onward(crossing.along))
 
@@ -408,7 +409,8 @@ class LightVisitor:
     @property
     def sees_through(self) -> bool:
         """Whether emitters behind objects are found without chance, `emitter_behind`."""
-        return self.unscattered is not None and not (self.media.varies or self.media.carried)
+        beyond = self.media.varies or self.media.carried or self.media.inner is not None
+        return self.unscattered is not None and not beyond
 
     def seen_emitters(
         self, walk: Walk, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32, active: mi.Bool

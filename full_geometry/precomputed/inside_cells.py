@@ -4,7 +4,8 @@ Light that has not scattered reaches a few mean free paths deep. Bricks of 4³ c
 the surface is nearer than that, and a table of all bricks tells which: an object of hundreds of mean free paths has as
 many cells as its surface is large. Bricks beyond the first few mean free paths have 2³ cells of edge 2 h.
 
-A cell that the surface cuts holds a part of the inside only. A function on the cells that is linear in each, least
+The inside is that of the surface without the shapes that lie in it. A cell that one of these surfaces cuts holds a part
+of it only. A function on the cells that is linear in each, least
 squares over the inside, needs the moments of that part,
 
     m_jk = ∫_inside x_j x_k dx / h³,    x = (1, x, y, z),
@@ -15,6 +16,7 @@ neighbour.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -98,25 +100,27 @@ class InsideCells:
 
     @classmethod
     def of(
-        cls, media: WalkMedia, k: int, points: SurfaceParts, box: tuple[np.ndarray, np.ndarray], h: float,
-        depths: tuple[float, float],
+        cls, media: WalkMedia, k: int, points: tuple[SurfaceParts, SurfaceParts], box: tuple[np.ndarray, np.ndarray],
+        h: float, depths: tuple[float, float],
     ) -> InsideCells:  # fmt: skip
         """The cells of object k.
 
         Args:
-            points: so many uniform over its surface for each square of a scene unit, part by part.
+            points: so many uniform over its surface for each square of a scene unit, part by part; and over those of
+                shapes in it.
             box: its least and largest coordinates.
             h: edge of a cell, from `cell_edge`.
             depths: below the surface, beyond which cells are coarse, and beyond which there are none, scene units.
         """
-        # ---- bricks that the surface cuts and those near them, and cells of the former that it cuts
+        # ---- bricks that surfaces cut and those near the own, and cells of the former that they cut
         counts = brick_counts(box, h)
         low = 0.5 * (box[0] + box[1]) - 0.5 * BRICK * counts * h
-        surface = _crossed_bricks(points, low, h, counts)
-        bricks = np.flatnonzero(surface)
-        axes = _crossed_cells(points, low, h, counts, bricks)
-        apart = distance_transform_cdt(~surface.reshape(counts[::-1]), "chessboard").ravel()
+        outer, inner = (_crossed_bricks(each, low, h, counts) for each in points)
+        apart = distance_transform_cdt(~outer.reshape(counts[::-1]), "chessboard").ravel()
         near, far = (np.ceil(min(depth / (BRICK * h), 1e6)) for depth in depths)
+        surface = outer | inner
+        bricks = np.flatnonzero(surface & (apart <= far))
+        axes = _crossed_cells(points, low, h, counts, bricks)
 
         # ---- what of them is inside; of the cut cells by measurement
         inside, whole = _inside(media, k, (surface, bricks, axes >= 0), low, h, counts)
@@ -325,14 +329,14 @@ def _crossed_bricks(points: SurfaceParts, low: np.ndarray, h: float, counts: np.
 
 
 def _crossed_cells(
-    points: SurfaceParts, low: np.ndarray, h: float, counts: np.ndarray, bricks: np.ndarray
+    points: tuple[SurfaceParts, ...], low: np.ndarray, h: float, counts: np.ndarray, bricks: np.ndarray
 ) -> np.ndarray:
     """The axis nearest to a normal in each cell of bricks, (bricks, 64); -1 where no point reaches.
     It is that of the point whose normal is nearest to an axis."""
     place = np.full(int(counts.prod()), -1, dtype=np.int32)
     place[bricks] = np.arange(len(bricks))
     place, best = aligned(mi.Int32, place), dr.zeros(mi.UInt32, BRICK**3 * len(bricks))
-    for part in points(POINTS[1] / h**2):
+    for part in itertools.chain.from_iterable(each(POINTS[1] / h**2) for each in points):
         n = dr.abs(part.n)
         axis = dr.select(n.x >= dr.maximum(n.y, n.z), mi.UInt32(0), dr.select(n.y >= n.z, mi.UInt32(1), 2))
         rank = 4 * mi.UInt32(2**20 * dr.max(n)) + axis + 1
@@ -371,15 +375,22 @@ def _points(x: np.ndarray, low: np.ndarray, h: float) -> mi.Point3f:
 
 
 def _own_hit(media: WalkMedia, k: mi.Int32, ray: mi.Ray3f) -> tuple[mi.Float, mi.Bool, mi.Bool]:
-    """Distance to the surface of object k along a ray, whether it is met, and whether the ray leaves the object."""
+    """Distance to a surface that bounds the inside of object k along a ray, whether one is met, and whether the ray
+    leaves the inside there."""
+    scene = (media.inner or media).scene
 
     def nearer(t: mi.Float, found: mi.Bool, leaves: mi.Bool, going: mi.Bool) -> tuple:
         si = media.instance_scene.intersect(
-            media.scene, mi.Ray3f(ray.o + ray.d * t, ray.d), mi.RayFlags.Minimal, active=going
+            scene, mi.Ray3f(ray.o + ray.d * t, ray.d), mi.RayFlags.Minimal, active=going
         )
-        hit = going & si.is_valid()
-        own = hit & (media.met(si, k) == k)
-        out = dr.dot(si.n, ray.d) * media.side(k, si.prim_index) > 0
+        hit, along = going & si.is_valid(), dr.dot(si.n, ray.d)
+        own = hit & ((media.index_of(si, hit) if media.inner else media.met(si, k)) == k)
+        out = along * media.side(k, si.prim_index) > 0
+        if media.inner is not None:  # shapes in it, which the ray leaves the inside to enter
+            number = media.inner.instance_table.number(si, hit)
+            side = dr.gather(mi.Float, media.holes.side, dr.maximum(number, 0))
+            out = dr.select(own, out, along * side <= 0)
+            own |= hit & (media.inner.around(si) == k)
         step = media.row("rounding", k)
         t = dr.select(hit, t + si.t + dr.select(own, 0, step), t)
         return t, found | own, dr.select(own, out, leaves), hit & ~own

@@ -11,8 +11,9 @@ fewer than FEW events since the camera's path entered at the last of them, all o
 
 A path of light begins as rays of unscattered light do, but may also be reflected there. It walks through objects and
 between them. Each of its events adds the weight with which it arrives over sigma_s, the estimate of ∫ L_s dw dx by
-collisions, but for those that L_0 holds: the first event of a path that has not left the object it began at. Light by
-way of other surfaces than objects is left to paths from the camera: a share of them goes on for that.
+collisions, but for those that L_0 holds: the first event of a path that has met nothing but the boundary of its first
+object. Light by way of other surfaces than objects and those in them is left to paths from the camera: a share of them
+goes on for that.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ ONWARD = 0.25  # share of walks that go on beyond FEW events where other surface
 @dataclass
 class LightPath:
     """What a walk from an emitter carries.
-    `flux`: where it began. `direct`: whether it has not left the object since."""
+    `flux`: where it began. `direct`: whether it has met nothing but the boundary of that object since."""
 
     flux: mi.Spectrum
     direct: mi.Bool
@@ -166,8 +167,9 @@ class ScatteredLight(Visitor):
         return walk, path
 
     def crossing(self, walk: Walk, path: LightPath, crossing: Crossing) -> tuple[Walk, LightPath]:
-        weight = dr.select(crossing.leaves, walk.weight * adjoint(crossing.si, crossing.along, walk.d), walk.weight)
-        return replace(walk, weight=weight), replace(path, direct=path.direct & ~crossing.leaves)
+        stays = crossing.reflected(self.media, walk.d)
+        weight = dr.select(stays, walk.weight, walk.weight * adjoint(crossing.si, crossing.along, walk.d))
+        return replace(walk, weight=weight), replace(path, direct=path.direct & stays)
 
 
 def adjoint(si: mi.SurfaceInteraction3f, along: mi.Vector3f, d: mi.Vector3f) -> mi.Float:

@@ -7,8 +7,8 @@ reflected inside, bring it to the cells of a grid, once for an image. A walk the
     weight ∫ p(w.w') L_0(x, w') dw',
 
 and drops the emitters that it meets after its last event as long as it has met nothing but the boundary of the object
-since, as the grid holds their light. Light that comes by way of other surfaces, or through another part of the object,
-stays to be met by chance.
+since, as the grid holds their light. Light that comes by way of other surfaces, of those inside the object too, or
+through another part of the object, stays to be met by chance.
 
 Rays begin at points uniform over the surface, each with one sample of the emitters. Along a ray six points are drawn by
 the transmittance, each channel in turn (balance heuristic), and added to the moments of L_0 in their cells. The fit in
@@ -28,7 +28,7 @@ that: phase functions are cut after q_2 = g² instead, and MOST_TRUNCATED bounds
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import zip_longest
@@ -42,7 +42,7 @@ from full_geometry.geometry.instances import corners, ends_of
 from full_geometry.geometry.points import EntrySample, opaque, sided
 from full_geometry.precomputed.forward_scattering import kept_forward, quadratic_part, split_extinction, truncated
 from full_geometry.precomputed.inside_cells import RIDGE, CellIndex, InsideCells, cell_edge
-from full_geometry.precomputed.lit_points import bend, entries, lit_points, multiples, to_world
+from full_geometry.precomputed.lit_points import bend, entries, lit_points, multiples, points_of, to_world
 from full_geometry.precomputed.scattered_light import ScatteredLight
 from full_geometry.precomputed.transport_matrix import R_2
 from full_geometry.walk.media import WalkMedia
@@ -167,7 +167,7 @@ def _scattered(
     D = dr.zeros(mi.Float, n * sum(grid.slots for grid in cells))
     dr.eval(D)
     tracer = ScatteredLight(scene, media, light.index, light.tables, D)
-    for k in range(len(cells)):
+    for k in np.flatnonzero(~np.array(media.enclosed(dr.arange(mi.Int32, len(cells))))).tolist():
         tracer.trace(k, max(paths // len(cells), FEWEST_PATHS), seed)
 
     # ---- the fit of each
@@ -210,8 +210,13 @@ def obstacle(media: WalkMedia) -> str:
     """Why light of a scene must be sampled; "" where it can be precomputed."""
     if mi.is_spectral:
         return f"the variant {mi.variant()} has no light by channel"
+    if media.overlaps:
+        return "objects overlap"
     if media.inner is not None:
-        return "something lies inside an object"
+        try:
+            media.holes  # noqa: B018
+        except ValueError as error:
+            return f"inside an object {error}"
     for obj, inside, around in zip_longest(media.objects, media.specs, media.wrappings):
         if not obj.closed:
             return f"object {obj.name} is not closed"
@@ -231,8 +236,10 @@ def obstacle(media: WalkMedia) -> str:
 
 
 def holds_scattered(media: WalkMedia) -> bool:
-    """Whether cells can hold scattered light: media are even in direction and in space, and not of each walk."""
-    return not (media.varies or media.carried) and not any(np.any(spec.medium.g) for spec in media.specs)
+    """Whether cells can hold scattered light: media are even in direction and in space and not of each walk, and no
+    light shines inside objects."""
+    even = not (media.varies or media.carried) and not any(np.any(spec.medium.g) for spec in media.specs)
+    return even and not (media.inner is not None and media.inner.shines)
 
 
 def inside_cells_of(
@@ -246,7 +253,7 @@ def inside_cells_of(
             results.append(cells[k])
             continue
         points = partial(_surface_points, media, k, _extent(media, k)[0])
-        results.append(InsideCells.of(media, k, points, box, h, depths))
+        results.append(InsideCells.of(media, k, (points, partial(_points_of_holes, media, k)), box, h, depths))
     return results
 
 
@@ -273,12 +280,28 @@ def _extent(media: WalkMedia, k: int) -> tuple[float, float]:
 
 def _surface_points(media: WalkMedia, k: int, area: float, density: float) -> Iterator[EntrySample]:
     """Points over the surface of object k in order along its faces, of this density, by parts of MOST_POINTS."""
-    n = max(density * area, FEWEST_POINTS)
+    return _even_points(partial(entries, media, k), density * area)
+
+
+def _points_of_holes(media: WalkMedia, k: int, density: float) -> Iterator[EntrySample]:
+    """The same over the surfaces of shapes in object k."""
+    if media.inner is None:
+        return
+    table, around = media.inner.instance_table, np.array(media.inner.tables["around"])
+    for number in np.flatnonzero(around == k):
+        drawn = partial(points_of, table, media.holes.shapes, int(number))
+        area = float(np.mean(np.array(next(_even_points(drawn, 1)).weight)))
+        yield from _even_points(drawn, density * area)
+
+
+def _even_points(drawn: Callable[[list[mi.Float]], EntrySample], number: float) -> Iterator[EntrySample]:
+    """So many points of a surface in order along its faces, at least FEWEST_POINTS."""
+    n = max(number, FEWEST_POINTS)
     parts = math.ceil(n / MOST_POINTS)
     width = math.ceil(n / parts)
     for part in range(parts):
         u = (dr.arange(mi.Float, width) + 0.5) * opaque(1 / (width * parts)) + opaque(part / parts)
-        yield entries(media, k, [dr.minimum(u, 1 - 2**-24), *multiples(R_2, (0.5, 0.5), width, part * width)])
+        yield drawn([dr.minimum(u, 1 - 2**-24), *multiples(R_2, (0.5, 0.5), width, part * width)])
 
 
 def _extinction(media: WalkMedia, kind: int) -> np.ndarray:
@@ -336,7 +359,7 @@ class _Rays:
         si, flux = lit_points(self.scene, media, number, rays, (seed, number), rng)
         bs, value = sample_bsdf(media.boundary(self.k), si, rng, _only(mi.BSDFFlags.Transmission))
         d, _ = sided(si, bs.wo)
-        enters = (bs.pdf > 0) & (dr.dot(d, si.n) < 0)
+        enters = (bs.pdf > 0) & (dr.dot(d, si.n) < 0) & ~media.enclosed(self.k)
         flux = dr.select(enters, flux * value * bend(si, bs.wo, d), 0)
         enters &= dr.max(flux) > 0
         T = dr.full(mi.Spectrum, 1, rays)
@@ -350,9 +373,8 @@ class _Rays:
         """Light along a ray as far as the surface, and its reflection there."""
         # ---- find the end of the segment
         media, d = self.media, ray.d
-        si = media.instance_scene.intersect(
-            media.scene, mi.Ray3f(ray.o + ray.off, d), mi.RayFlags.All, active=ray.alive
-        )
+        scene = (media.inner or media).scene
+        si = media.instance_scene.intersect(scene, mi.Ray3f(ray.o + ray.off, d), mi.RayFlags.All, active=ray.alive)
         alive = ray.alive & si.is_valid()
         far = dr.select(alive, dr.maximum(si.t + dr.dot(ray.off, d), 0), 0)
 
@@ -367,8 +389,10 @@ class _Rays:
         media, d, rng = self.media, ray.d, ray.rng
 
         # ---- reflection: flux F, with roulette; behind an object that overlaps the ray goes on, and behind its own
-        # boundary if rounding has put it outside
-        met = media.met(si, self.k) == self.k
+        # boundary if rounding has put it outside; a shape in the object ends it
+        met = (media.index_of(si, alive) if media.inner else media.met(si, self.k)) == self.k
+        if media.inner is not None:
+            alive = alive & (media.inner.around(si) != self.k)
         si = media.seen(si, self.k, d)
         own = met & (dr.dot(si.n, d) > 0)
         bs, value = sample_bsdf(media.boundary(self.k), si, rng, _only(mi.BSDFFlags.Reflection))

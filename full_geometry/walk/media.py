@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
+from functools import cached_property
 from types import ModuleType
 from typing import NamedTuple
 from weakref import WeakKeyDictionary
@@ -23,7 +25,7 @@ from full_geometry.geometry.instances import (
 )
 from full_geometry.geometry.points import lift
 from full_geometry.geometry.rounding import clear
-from full_geometry.geometry.shape import Geometry, analyse_shape, check_together, pointer_numbers, scene_of
+from full_geometry.geometry.shape import Geometry, analyse_shape, check_together, name_of, pointer_numbers, scene_of
 from full_geometry.objects.inclusions import Inclusion, find_inclusions, refracts
 from full_geometry.objects.objects import TranslucentObject, translucent_shapes
 from full_geometry.objects.small_emitters import is_delta
@@ -118,6 +120,11 @@ class InclusionTable:
         lights = [(light, k) for light, k in lights.values() if is_delta(light) and k >= 0]
         return cls(instance_table.scene(scene), instance_table, tables, lights, priorities)
 
+    @property
+    def shines(self) -> bool:
+        """Whether there are lamps among these."""
+        return bool(self.lights) or any(shape.is_emitter() for shape in self.instance_table.shapes)
+
     def around(self, si: mi.SurfaceInteraction3f) -> mi.Int32:
         """The number of the object around what a ray has met, or -1."""
         return self._met("around", si, -1)
@@ -129,6 +136,15 @@ class InclusionTable:
     def _met(self, key: str, si: mi.SurfaceInteraction3f, otherwise: int | bool) -> mi.Int32 | mi.Bool:
         number, table = self.instance_table.number(si), self.tables[key]
         return dr.select(number >= 0, dr.gather(type(table), table, dr.maximum(number, 0)), otherwise)
+
+
+class Holes(NamedTuple):
+    """The shapes of an `InclusionTable`, with the sides of their surfaces.
+    `shapes`: by their place in the table. `side`: by number, 1 where geometric normals point outwards, -1 where they
+    point inwards, 0 of what is not closed and has the medium on both sides."""
+
+    shapes: list[Geometry]
+    side: mi.Float
 
 
 def _shapes(result: list[Inclusion]) -> list[mi.Shape]:
@@ -429,6 +445,31 @@ class WalkMedia:
             if surface.spec.textured is not None:
                 surface.spec.textured.check(obj)
         return replace(self, specs=[each.spec for each in surfaces], boundaries=[each.boundary for each in surfaces])
+
+    def enclosed(self, k: mi.Int32) -> mi.Bool:
+        """Whether object k lies inside another."""
+        return (k < 0) if self.inner is None else dr.gather(mi.Int32, self.inner.tables["around"], k) >= 0
+
+    @cached_property
+    def holes(self) -> Holes | None:
+        """The shapes inside objects, as far as they bound the media around them; None where nothing lies inside.
+        ValueError if one has no area, as curves, or faces to both sides, or as of `analyse_shape`."""
+        if self.inner is None:
+            return None
+        table, shapes = self.inner.instance_table, list(self.objects)
+        for shape in table.shapes[len(shapes) :]:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # a sheet inside an object is no mistake
+                try:
+                    shapes.append(analyse_shape(shape, self.scene))
+                except RuntimeError:  # of Mitsuba
+                    raise ValueError(f"a shape must have an area, got {name_of(shape)}") from None
+        for each in shapes:
+            if each.signs is not None:
+                raise ValueError(f"faces must point to one side, got both of {each.name}")
+        side = mi.Float([shapes[kind].sign if shapes[kind].closed else 0.0 for kind in table.kind])
+        dr.make_opaque(side)
+        return Holes(shapes, side)
 
     @property
     def same_g(self) -> bool:

@@ -198,6 +198,13 @@ class Crossing:
     pdf: mi.Float  # density of the new direction, 1/sr
     delta: mi.Bool  # whether that direction was the only one
 
+    def reflected(self, media: WalkMedia, d: mi.Vector3f) -> mi.Bool:
+        """Whether the boundary of an object has reflected a walk back into it, along d."""
+        if media.inner is None:
+            return ~self.leaves
+        inwards = (dr.dot(self.along, self.si.n) > 0) & (dr.dot(d, self.si.n) < 0)
+        return inwards & (media.index_of(self.si) >= 0)
+
 
 class Visitor(Protocol):
     """What is recorded of a walk. Each method returns the walk, whose random numbers it may use up, and its record: as

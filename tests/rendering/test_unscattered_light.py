@@ -67,11 +67,11 @@ def _compare(surface: dict, known_to: float, shape: dict | None = None, spp: int
 # ---- cells
 
 
-def _cells(shape: dict, surface: dict = MEDIUM) -> Any:
+def _cells(shape: dict, surface: dict = MEDIUM, **more: Any) -> Any:
     from full_geometry.precomputed.unscattered_light import inside_cells_of
     from full_geometry.walk.media import WalkMedia
 
-    scene = _scene("precomputed", surface, shape, light={"type": "constant"})
+    scene = _scene("precomputed", surface, shape, light={"type": "constant"}, **more)
     return inside_cells_of(WalkMedia.of(scene, 1.0))[0]
 
 
@@ -101,6 +101,25 @@ def _moments(cells: Any) -> tuple[np.ndarray, ...]:
 @pytest.mark.parametrize(("shape", "volume"), [(_ball, 4 / 3 * np.pi * 125), (_cube, 512.0)])
 def test_cells_have_the_volume_of_an_object(shape: Any, volume: float) -> None:
     _, _, edge, M = _moments(_cells(shape()))
+    assert (M[:, 0, 0] * edge**3).sum() == pytest.approx(volume, rel=2e-3)
+
+
+def _held(kind: str, x: float = 1.0, radius: float = 2.0) -> dict:
+    """A ball, or a sheet, below the surface of a ball of 5 towards lamp and camera."""
+    place = {"center": [x, 1.0, 2.0]}
+    surfaces = {"stone": {"type": "diffuse", "reflectance": 0.7}, "medium": {"type": "translucent", **WHITE},
+                "bubble": {"type": "dielectric", "int_ior": 1.0, "ext_ior": 1.5}}  # fmt: skip
+    if kind == "sheet":
+        at = mi.ScalarTransform4f().translate(place["center"]).scale(2)
+        return {"type": "disk", "to_world": at, "bsdf": {"type": "twosided", "bsdf": surfaces["stone"]}}
+    return {**_ball(radius, **place), "bsdf": surfaces[kind]}
+
+
+@pytest.mark.parametrize("kind", ["stone", "bubble", "medium", "sheet"])
+def test_cells_leave_out_what_lies_inside_an_object(kind: str) -> None:
+    """A sheet has no volume."""
+    _, _, edge, M = _moments(_cells(_ball(), held=_held(kind)))
+    volume = 4 / 3 * np.pi * (125 - 8 * (kind != "sheet"))
     assert (M[:, 0, 0] * edge**3).sum() == pytest.approx(volume, rel=2e-3)
 
 
@@ -193,28 +212,38 @@ def test_a_hollow_or_branching_object_without_absorption_is_invisible_in_uniform
     _furnace(_mesh(shape, tmp_path), 0.004)
 
 
-def _pair(gap: float) -> tuple[dict, dict]:
+@pytest.mark.slow
+def test_a_bubble_and_a_second_medium_without_absorption_are_invisible_in_uniform_light() -> None:
+    _furnace(_ball(), 0.008, bubble=_held("bubble", 1.8, 1.5), medium=_held("medium", -1.8, 1.5))
+
+
+def _pair() -> tuple[dict, dict]:
     """Two balls beside each other."""
-    x = 2.5 + 0.5 * gap
-    return _ball(2.5, center=[-x, 0, 0]), _ball(2.5, center=[x, 0, 0])
+    return _ball(2.5, center=[-2.5, 0, 0]), _ball(2.5, center=[2.5, 0, 0])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("gap", [0.0, 0.2])
-def test_two_balls_without_absorption_are_invisible_in_uniform_light(gap: float) -> None:
-    one, other = _pair(gap)
+def test_two_balls_that_touch_without_absorption_are_invisible_in_uniform_light() -> None:
+    one, other = _pair()
     _furnace(one, 0.004, other={**other, "bsdf": {"type": "translucent", **WHITE}})
 
 
 @pytest.mark.slow
 def test_precomputed_light_of_two_balls_that_touch_has_the_mean_of_sampled_light() -> None:
-    one, other = _pair(0.0)
+    one, other = _pair()
     other["bsdf"] = {"type": "translucent", **MEDIUM, "sigma_s": "2.0,1.0,0.7"}
     _compare(MEDIUM, 0.02, one, other=other, lamp=_lamp())
 
 
 def test_precomputed_light_of_a_lamp_has_the_mean_of_sampled_light() -> None:
     _compare(MEDIUM, 0.015, spp=1024, lamp=_lamp())
+
+
+@pytest.mark.slow
+def test_precomputed_light_around_what_lies_inside_has_the_mean_of_sampled_light() -> None:
+    held = {"medium": _held("medium", -1.8, 1.5), "bubble": _held("bubble", 1.8, 1.5)}
+    stone = {**_ball(1.2, center=[0, -2.5, 3]), "bsdf": {"type": "diffuse", "reflectance": 0.7}}
+    _compare(MEDIUM, 0.02, spp=2048, stone=stone, lamp=_lamp(), **held)
 
 
 @pytest.mark.slow
@@ -349,16 +378,18 @@ def test_the_layer_of_emission_holds_the_mirror_and_what_is_behind_the_object() 
 
 
 @pytest.mark.parametrize(
-    ("surface", "shape", "reason"),
+    ("surface", "other", "reason"),
     [
         ({**MEDIUM, "orders": "single"}, None, "orders of object 'object' are 'single'"),
         ({**PAINTED, "g": 0.8}, None, r"abs\(g\) of object 'object' is above 0.5 in a scene where a medium varies"),
         ({**MEDIUM, "sigma_s": 1e4}, None, "so many mean free paths wide"),
+        (MEDIUM, {"type": "sphere", "center": [7, 0, 0], "radius": 4.0}, "objects overlap"),
     ],
 )
-def test_light_that_cannot_be_precomputed_is_refused_by_its_reason(surface: dict, shape: Any, reason: str) -> None:
+def test_light_that_cannot_be_precomputed_is_refused_by_its_reason(surface: dict, other: Any, reason: str) -> None:
+    more = {"other": {**other, "bsdf": {"type": "translucent", **MEDIUM}}} if other else {}
     with pytest.raises(ValueError, match=f"light must be auto or sampled, got 'precomputed': .*{reason}"):
-        mi.render(_scene("precomputed", surface, shape, lamp=_lamp()), spp=1)
+        mi.render(_scene("precomputed", surface, lamp=_lamp(), **more), spp=1)
 
 
 @pytest.mark.parametrize("light", ["auto", "precomputed", "sampled"])
