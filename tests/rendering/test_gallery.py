@@ -35,7 +35,7 @@ def test_every_scene_has_a_test() -> None:
     names = sorted(path.stem for path in FOLDER.glob("*.xml"))
     assert names == sorted(CORRECTED + PRECOMPUTED + WALKED) == sorted(gallery_figure.SCENES)
     draft, paper = gallery_figure.parts("draft"), gallery_figure.parts("paper")
-    assert len({part.name for part in draft}) == len(draft) == len(paper) == 16
+    assert len({part.name for part in draft}) == len(draft) == len(paper) == 20
 
 
 @pytest.mark.slow
