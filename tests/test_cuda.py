@@ -57,31 +57,6 @@ def test_every_model_gives_the_value_of_numpy(name: str, queries: object) -> Non
         assert np.allclose(S, wanted, rtol=1e-3, atol=1e-6 * wanted.max()), (S[worst], wanted[worst])
 
 
-def test_the_universal_network_is_differentiated_by_the_medium_as_by_torch() -> None:
-    torch = pytest.importorskip("torch")
-    import drjit as dr
-
-    from halfspace_sss.neural.differentiable import neural_S
-
-    given, Float = [np.full(64, v, np.float32) for v in (0.8, 0.3, 0.7, 0.1)], dr.cuda.ad.Float
-    r, medium = np.linspace(0.2, 2.0, 64, dtype=np.float32), (1.2, 0.8, 0.2, 1.4)
-    here = [torch.tensor(v, dtype=torch.float64) for v in medium]
-    rest = [torch.from_numpy(v.astype(float)) for v in (r, *given)]
-    for k in range(2):
-        there = [Float(v) for v in medium]
-        dr.enable_grad(there[k])
-        S = neural_S(*there, Float(r), *map(Float, given))
-        dr.set_grad(there[k], 1.0)
-        dr.forward_to(S)
-
-        def of(value: object, k: int = k) -> object:
-            return neural_S(*here[:k], value, *here[k + 1 :], *rest)
-
-        values, slopes = torch.autograd.functional.jvp(of, here[k], torch.ones_like(here[k]))
-        assert np.allclose(S.numpy(), values.numpy(), rtol=0.03), (S, values)
-        assert np.allclose(dr.grad(S).numpy(), slopes.numpy(), rtol=0.03, atol=0.03 * slopes.abs().max())
-
-
 def test_scenes_that_do_not_belong_together_are_refused() -> None:
     def ask() -> None:
         import mitsuba as mi

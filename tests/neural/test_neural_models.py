@@ -1,4 +1,4 @@
-"""What is special to the learnt models: range, size, accuracy of what is shipped, gradients of the medium."""
+"""What is special to the learnt models: range, size, accuracy of what is shipped."""
 
 from __future__ import annotations
 
@@ -10,11 +10,9 @@ from halfspace_sss import Medium
 from halfspace_sss.comparison.model_errors import ReferenceSize, model_error, reference_maps
 from halfspace_sss.comparison.model_truths import sampled_reflectance
 from halfspace_sss.maps.noisy_maps import CellGrid
-from halfspace_sss.neural.differentiable import neural_S
 from halfspace_sss.neural.universal import shipped_weights
 
 FIG10 = Medium.from_albedo(0.75, 1.0, 0.0, 1.3)
-RATIOS = {"sigma_t": 2.0, "albedo": 0.9, "g": 0.3, "eta": 1.4}
 QUERY = (np.array([0.3, 1.0, 2.0]), 0.7, 0.4, 0.9, 0.2)
 
 
@@ -64,33 +62,3 @@ def test_sampled_reflectance_agrees_with_quadrature_for_a_smooth_model():
     model = halfspace_sss.bssrdf("better_dipole", FIG10)
     R, error = sampled_reflectance(model, 1.0)
     assert R == pytest.approx(halfspace_sss.measure.reflectance(model, 1.0), rel=1e-4) and error < 1e-5
-
-
-def _finite_differences() -> dict[str, float]:
-    def total(**ratios):
-        medium = Medium.from_albedo(ratios["albedo"], ratios["sigma_t"], ratios["g"], ratios["eta"])
-        return halfspace_sss.bssrdf("neural", medium).eval(*QUERY).sum()
-
-    h = 1e-4
-    return {k: (total(**{**RATIOS, k: v + h}) - total(**{**RATIOS, k: v - h})) / (2 * h) for k, v in RATIOS.items()}
-
-
-def test_drjit_differentiates_with_respect_to_the_medium():
-    import drjit as dr
-    from drjit.llvm.ad import Float
-
-    ratios = {k: Float(v) for k, v in RATIOS.items()}
-    dr.enable_grad(list(ratios.values()))
-    S = neural_S(**ratios, **_named(lambda x: Float(np.asarray(x, np.float32))))
-    dr.backward(dr.sum(S))
-    for name, slope in _finite_differences().items():
-        assert dr.grad(ratios[name])[0] == pytest.approx(slope, rel=1e-2)
-
-
-def _named(convert) -> dict:
-    return {k: convert(v) for k, v in zip(("r", "mu_i", "phi_i", "mu_o", "phi_o"), QUERY)}
-
-
-def test_numbers_are_refused_where_gradients_are_asked_for():
-    with pytest.raises(ValueError, match="sigma_t must be a Dr.Jit array, got float"):
-        neural_S(**RATIOS, **_named(lambda x: x))
