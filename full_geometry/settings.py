@@ -15,12 +15,11 @@ if TYPE_CHECKING:
 AUTOMATIC = -1.0
 MM_PER_UNIT = (1e-9, 1e9)
 ORDERS = ("total", "multiple", "single")
-GEOMETRIES = ("distance", "tangent")
 LIGHTS = ("sampled", "gathered", "corrected", "auto")
 GATHERED_LIGHTS = ("gathered", "corrected")  # found once, before the first sample
 WALK_LIGHTS = ("auto", "precomputed", "sampled")  # of `translucent_walk`
 SHARED = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters")  # what `translucent_walk` understands too
-OF_MODELS = ("geometry", "area_share", "entries")
+OF_MODELS = ("area_share", "entries")
 
 
 @dataclass(frozen=True)
@@ -31,7 +30,6 @@ class Settings:
         mm_per_unit: millimetres in one unit of the scene.
         max_depth: vertices of a path after the camera, an entry and its exit counting as one; -1 for no limit.
         rr_depth: vertices after which Russian roulette begins.
-        geometry: "distance" or "tangent", see `points.separation`.
         area_share: share of the candidates for an entry that are drawn uniformly over the area, the others by a probe
             near the exit, 0 to 1; AUTOMATIC chooses by the ratio of the distance that light travels to the size of the
             object.
@@ -49,7 +47,6 @@ class Settings:
     mm_per_unit: float = 1.0
     max_depth: int = -1
     rr_depth: int = 5
-    geometry: str = "distance"
     area_share: float = AUTOMATIC
     entries: int = int(AUTOMATIC)
     hide_emitters: bool = False
@@ -66,7 +63,6 @@ class Settings:
         check_depth("entries", self.entries)
         check_choice("light", self.light, LIGHTS)
         check_choice("orders", self.orders, ("", *ORDERS))
-        check_choice("geometry", self.geometry, GEOMETRIES)
         if self.area_share != AUTOMATIC:
             check_interval("area_share", self.area_share, 0.0, 1.0)
 

@@ -170,30 +170,14 @@ def local_frame(n: mi.Normal3f, d: mi.Vector3f) -> Frame:
     return Frame(t, dr.cross(n, t), n)
 
 
-def separation(p_i: mi.Point3f, n_i: mi.Normal3f, p_o: mi.Point3f, n_o: mi.Normal3f, geometry: str) -> mi.Float:
-    """Distance r of the half-space query, in scene units.
-
-    "distance" takes |d|, d = x_o - x_i. "tangent" takes sqrt(d² - c (d.n)²), n along n_i + n_o and c = max(n_i.n_o, 0):
-    the length of d in the common tangent plane where the normals are parallel, |d| where they are at right angles or
-    turn away from each other, as on the two sides of something thin.
-    """
-    d = p_o - p_i
-    if geometry == "distance":
-        return dr.norm(d)
-    middle = n_i + n_o
-    along = dr.square(dr.dot(d, middle)) / dr.maximum(dr.squared_norm(middle), 1e-12)
-    return dr.sqrt(dr.maximum(dr.squared_norm(d) - dr.maximum(dr.dot(n_i, n_o), 0) * along, 0))
-
-
-def plane_query(at: SurfacePoint, out: SurfacePoint, geometry: str) -> tuple[mi.Float, ...]:
+def plane_query(at: SurfacePoint, out: SurfacePoint) -> tuple[mi.Float, ...]:
     """(r, mu_i, phi_i, mu_o, phi_o) of the half-space for light that enters at `at` and leaves at `out`.
-    r as in `separation`; each direction is taken against the normal of its own point, its azimuth from x_i -> x_o
-    projected there. Cosines below the horizon come out as 0, at which every model is 0."""
+    r = |x_o - x_i| in scene units; each direction is taken against the normal of its own point, its azimuth from
+    x_i -> x_o projected there. Cosines below the horizon come out as 0, at which every model is 0."""
     d = out.p - at.p
     frame_i, frame_o = local_frame(at.n_out, d), local_frame(out.n_out, d)
     mu_i, mu_o = (dr.clip(dr.dot(point.w, point.n_out), 0, 1) for point in (at, out))
-    r = separation(at.p, at.n_out, out.p, out.n_out, geometry)
-    return r, mu_i, frame_i.azimuth(at.w), mu_o, frame_o.azimuth(out.w)
+    return dr.norm(d), mu_i, frame_i.azimuth(at.w), mu_o, frame_o.azimuth(out.w)
 
 
 # --------------------------------------------------------------------------------------------------

@@ -39,11 +39,9 @@ POINTS_PER_RATIO, MOST_POINTS = 60.0, 9  # candidates over the area
 @dataclass(frozen=True, eq=False)
 class HalfSpaceTransport(Transport):
     """S of the half-space at the distance of two surface points, see `plane_query`.
-    `models`: one per channel, in scene units. `geometry`: "distance" or "tangent", see `points.separation`. `precise`:
-    asked `in_double`, for differences."""
+    `models`: one per channel, in scene units. `precise`: asked `in_double`, for differences."""
 
     models: list[BSSRDF]
-    geometry: str = "distance"
     precise: bool = False
 
     @property
@@ -55,7 +53,7 @@ class HalfSpaceTransport(Transport):
         return tuple(checksum for model in self.models for checksum in model.checksums)
 
     def S(self, exit: SurfacePoint, at: SurfacePoint, active: mi.Bool = True) -> mi.Spectrum:
-        query = plane_query(at, exit, self.geometry)
+        query = plane_query(at, exit)
         above = active & (at.mu > 0) & (query[3] > 0)
         asked = in_double(query) if self.precise else query
         return dr.select(above, mi.Spectrum([mi.Float(model.eval(*asked)) for model in self.models]), 0)
@@ -63,7 +61,7 @@ class HalfSpaceTransport(Transport):
     def perturbed(self, media: Sequence[Medium]) -> HalfSpaceTransport:
         """See `medium_derivatives.PerturbableTransport`."""
         models = [bssrdf(model.name, m) for model, m in zip(self.models, media)]
-        return HalfSpaceTransport(models, self.geometry, True)
+        return HalfSpaceTransport(models, True)
 
 
 def in_double(query: tuple[mi.Float, ...]) -> tuple[mi.Float, ...]:
@@ -108,10 +106,10 @@ class HalfSpaceProposals(Proposals):
 
 def half_space_model(name: str, geometry: Geometry, media: Sequence[Medium], settings: Settings) -> ObjectModel:
     """The transport and the proposals of a half-space model on an object.
-    `media`: of each channel, 1/(scene unit). `settings`: geometry and share of uniform entries."""
+    `media`: of each channel, 1/(scene unit). `settings`: share of uniform entries."""
     models = [bssrdf(name, m) for m in media]
     positions = positions_of([each for each, m in zip(models, media) if float(m.sigma_s) > 0], name, geometry, settings)
-    return ObjectModel(HalfSpaceTransport(models, settings.geometry), HalfSpaceProposals(positions, models[0]))
+    return ObjectModel(HalfSpaceTransport(models), HalfSpaceProposals(positions, models[0]))
 
 
 def positions_of(models: list[BSSRDF], name: str, geometry: Geometry, settings: Settings) -> PositionSampler:

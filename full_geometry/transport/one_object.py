@@ -89,7 +89,7 @@ class HalfSpace:
 
     def query(self, o: SurfacePoint, i: SurfacePoint) -> tuple[tuple[mi.Float, ...], mi.Float, mi.Bool]:
         """The query of the models, both Fresnel transmittances, and whether both directions are above the horizons."""
-        query = plane_query(i, o, "distance")
+        query = plane_query(i, o)
         mu_i, mu_o, eta = query[1], query[3], self.object.eta
         F_t = fresnel.F_t(mu_i, eta) * fresnel.F_t(mu_o, eta)
         return query, F_t, (mu_i > 0) & (mu_o > 0) & (dr.dot(o.w, o.n) > 0) & (dr.dot(i.w, i.n) > 0)

@@ -404,13 +404,11 @@ def _albedo_of_v(v: Number, g: Number, c: Number) -> Number:
 @dataclass(frozen=True, eq=False)
 class PaletteTransport(Transport):
     """S = sqrt(S_o S_i) of the media at both ends, or S of that at the wavelengths of a ray.
-    `palette`: the models. `medium`: what varies, 1/(scene unit). `geometry`: "distance" or "tangent", see
-    `points.separation`."""
+    `palette`: the models. `medium`: what varies, 1/(scene unit)."""
 
     palette: Palette
     obj: Geometry
     medium: Varied
-    geometry: str = "distance"
 
     @property
     def orders(self) -> str:
@@ -425,7 +423,7 @@ class PaletteTransport(Transport):
 
     def S(self, exit: SurfacePoint, at: SurfacePoint, active: mi.Bool = True) -> mi.Spectrum:
         with dr.suspend_grad():
-            query = plane_query(at, exit, self.geometry)
+            query = plane_query(at, exit)
             above = active & (at.mu > 0) & (query[3] > 0)
         ends = self.medium.ends(self.obj, exit, at, above)
         return dr.select(above, self.palette.S(ends, query, above), 0)
@@ -439,11 +437,11 @@ def palette_model(
 ) -> ObjectModel:
     """The transport and the proposals of a half-space model on an object whose medium has textures or spectra.
     `media`: of each channel, 1/(scene unit); their g and eta hold. `medium`: what varies, 1/(scene unit). `settings`:
-    geometry and share of uniform entries. ValueError if the model knows some media only."""
+    share of uniform entries. ValueError if the model knows some media only."""
     palette = palette_of(name, geometry, media, medium)
     models = _spread(name, *_values_of(geometry, media, medium), media)
     positions = positions_of(models, name, geometry, settings)
-    transport = PaletteTransport(palette, geometry, medium, settings.geometry)
+    transport = PaletteTransport(palette, geometry, medium)
     known = medium if isinstance(medium, TexturedMedium) else None  # else that of the exit
     return ObjectModel(transport, HalfSpaceProposals(positions, models[0], known))
 

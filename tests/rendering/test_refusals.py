@@ -31,6 +31,7 @@ PLUGINS = [
     ({"type": "translucent", "material": "marble", "model": "path_traced"}, WALKS),
     ({"type": "bssrdf", "model": "path_traced"}, WALKS),
     ({"type": "bssrdf", "entrys": 3}, "parameter of bssrdf must be .*got 'entrys'"),
+    ({"type": "bssrdf", "geometry": "tangent"}, "parameter of bssrdf must be .*got 'geometry'"),
     ({"type": "bssrdf", "mm_per_unit": -1.0}, "mm_per_unit must be .*got -1.0"),
     ({"type": "translucent_walk", "mm_per_unit": 3e12}, r"mm_per_unit must be .*got 3000000000000.0"),
     ({"type": "translucent_walk", "entries": 3}, "parameter of translucent_walk must be .*got 'entries'"),

@@ -64,13 +64,6 @@ def test_both_samplers_of_entries_have_the_same_mean(share):
     assert abs(mean[1] - expected) < 4 * error[1] + 1e-3 * expected  # what lies beyond 20 mm
 
 
-@pytest.mark.parametrize("geometry", ["distance", "tangent"])
-def test_both_geometries_are_the_same_on_a_plane(geometry):
-    scene = plane_scene(surface(), sun(THETA_I, DELTA), THETA_O, geometry=geometry)
-    mean, error = mean_of_pixels(scene, 128)
-    assert abs(mean[1] - radiance_under_sun("standard_dipole", THETA_I, THETA_O, DELTA)) < 4 * error[1]
-
-
 @pytest.mark.parametrize("theta_i, theta_o", [(40, 30), (0, 60), (70, 0)])
 def test_single_scattering_of_a_flat_object_is_the_line_integral(theta_i, theta_o):
     scene = plane_scene(surface(orders="single"), sun(theta_i, DELTA), theta_o)

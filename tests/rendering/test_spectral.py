@@ -92,7 +92,7 @@ def test_models_take_the_medium_at_each_wavelength(model: str) -> None:
         w = dr.normalize(mi.Vector3f(x + 0.3 * rng.normal(size=(3, n))))
         ends.append(SurfacePoint(mi.Point3f(10 * x), mi.Normal3f(x), mi.Normal3f(x), w))
     S = np.array(obj.transport.S(ends[0]._replace(medium=obj.medium_at(si)), ends[1]))
-    query = plane_query(ends[1], ends[0], "distance")
+    query = plane_query(ends[1], ends[0])
     for found, wavelength in zip(S, nm):
         m = skin.medium(wavelength)
         alone = bssrdf(model, Medium(m.sigma_s, m.sigma_a, m.g, obj.media[0].eta).scaled(unit))
