@@ -1,8 +1,7 @@
 """The exact first order of scattering in a half-space with a smooth boundary: light that scatters exactly once.
 
 For a pencil beam this order is a distribution (the two refracted rays must meet), so that it is never a value of
-S; it is given integrated over the plane (`brdf`, `reflectance`), over exit directions (`exitance`), or as the
-line integral along the refracted exit ray that a renderer samples (`sample_vertex`, `contribution`).
+S; it is given integrated over the plane (`brdf`, `reflectance`) or over exit directions (`exitance`).
 
 mu' is the cosine inside, mu' = sqrt(1 - (1 - mu²)/eta²); c the cosine between the two directions of travel inside,
 c = -mu_i' mu_o' + sin_i' sin_o' cos(delta_phi), and delta_phi the azimuth of the light that leaves from that of the
@@ -14,7 +13,6 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -24,24 +22,8 @@ from halfspace_sss.physics.fresnel import F_t, mu_external, mu_internal, sine
 from halfspace_sss.physics.medium import Medium, eval_hg
 
 TINY = 1e-30
-_RANGES = dict.fromkeys(("phi", "delta_phi"), (-math.inf, math.inf)) | dict.fromkeys(("r", "s"), (0.0, math.inf))
+_RANGES = dict.fromkeys(("phi", "delta_phi"), (-math.inf, math.inf)) | {"r": (0.0, math.inf)}
 _NUMPY = library(0.0)
-
-
-class VertexSample(NamedTuple):
-    """Distance s along the refracted exit ray (mm), depth of the vertex (mm), density of s (1/mm)."""
-
-    s: Real
-    depth: Real
-    pdf: Real
-
-
-class Contribution(NamedTuple):
-    """f of `contribution` in 1/(mm sr), and x_i - x_o (mm) along and across the horizontal direction of exit."""
-
-    value: Real
-    x: Real
-    y: Real
 
 
 def _arguments(medium: Medium, **args: Real) -> tuple[Library, Sequence[Real]]:
@@ -71,15 +53,6 @@ def _sine(lib: Library, mu: Real, eta: float) -> Real:
     return lib.minimum(sine(mu) / eta, 1.0)
 
 
-def _throughput(lib: Library, medium: Medium, mu_i: Real, mu_o: Real, delta_phi: Real) -> Real:
-    """T_12 T_21 p(c) / eta², what `brdf` and `contribution` share."""
-    eta = medium.eta
-    sines = _sine(lib, mu_i, eta) * _sine(lib, mu_o, eta)
-    c = sines * lib.cos(delta_phi) - mu_internal(mu_i, eta) * mu_internal(mu_o, eta)
-    p = eval_hg(lib.maximum(lib.minimum(c, 1.0), -1.0), lib.constant(medium.g, mu_i))
-    return F_t(mu_i, eta) * F_t(mu_o, eta) * p / eta**2
-
-
 def brdf(medium: Medium, mu_i: Real, mu_o: Real, delta_phi: Real) -> Real:
     """Single scattering under uniform irradiation of the plane, the BRDF in 1/sr.
 
@@ -94,8 +67,11 @@ def brdf(medium: Medium, mu_i: Real, mu_o: Real, delta_phi: Real) -> Real:
     Source: Chandrasekhar 1960 for the matched boundary; the 1/eta² turns inside into outside solid angle.
     """
     lib, (mu_i, mu_o, delta_phi) = _arguments(medium, mu_i=mu_i, mu_o=mu_o, delta_phi=delta_phi)
-    sum_in = lib.maximum(mu_internal(mu_i, medium.eta) + mu_internal(mu_o, medium.eta), TINY)
-    return lib.constant(medium.albedo, mu_i) * _throughput(lib, medium, mu_i, mu_o, delta_phi) / sum_in
+    eta = medium.eta
+    a, b, sines = mu_internal(mu_i, eta), mu_internal(mu_o, eta), _sine(lib, mu_i, eta) * _sine(lib, mu_o, eta)
+    c = lib.maximum(lib.minimum(sines * lib.cos(delta_phi) - a * b, 1.0), -1.0)
+    throughput = F_t(mu_i, eta) * F_t(mu_o, eta) * eval_hg(c, lib.constant(medium.g, mu_i)) / eta**2
+    return lib.constant(medium.albedo, mu_i) * throughput / lib.maximum(a + b, TINY)
 
 
 @functools.cache
@@ -249,47 +225,3 @@ def _critical_length(lib: Library, eta: float, mu_i: Real, foot: Real) -> Real:
     b, k = foot * mu_c2, lib.maximum(mu_i / eta, 1e-8)
     root = lib.sqrt(b * b + k * k * mu_c2)
     return lib.where(b > 0, mu_c2 / (root + lib.abs(b)), (root + lib.abs(b)) / (k * k))
-
-
-def sample_vertex(medium: Medium, mu_o: Real, u: Real) -> VertexSample:
-    """Sample the scattering event on the refracted exit ray with density sigma_t exp(-sigma_t s); depth = s mu_o'.
-
-    Args:
-        medium: the medium; one with channels samples each channel (axis last) with the same u.
-        mu_o: external cosine of exit, [0, 1].
-        u: uniform numbers in [0, 1), any library; s = -ln(1 - u)/sigma_t.
-    Raises ValueError if an argument is out of range or libraries are mixed.
-    """
-    lib, (mu_o, u) = _arguments(medium, mu_o=mu_o, u=u)
-    sigma_t = lib.constant(medium.sigma_t, mu_o)
-    s = -lib.log(lib.maximum(1 - u, TINY)) / sigma_t
-    return VertexSample(s, s * mu_internal(mu_o, medium.eta), sigma_t * lib.exp(-sigma_t * s))
-
-
-def contribution(medium: Medium, s: Real, mu_i: Real, mu_o: Real, delta_phi: Real) -> Contribution:
-    """What light from w_i brings to (x_o, w_o) by scattering once at distance s on the refracted exit ray.
-
-    L_o(x_o, w_o) = ∫_0^∞ ds ∫_2pi dw_i f(s, w_i, w_o) L_i(x_i(s, w_i), w_i), over outside directions, with
-    f = sigma_s T_12 T_21 p(c) mu_i / (eta² mu_i') exp(-sigma_t (s + s_i)), s_i = s mu_o'/mu_i'; the cosine is included.
-    x_i - x_o = (-s sin_o' - s_i sin_i' cos(delta_phi), s_i sin_i' sin(delta_phi)) in the frame whose first axis is the
-    horizontal direction of w_o and whose third is the normal. An estimate of L_o is f L_i / (pdf(s) pdf(w_i)).
-
-    Args:
-        medium: the medium; if it has channels, s carries that axis last (length 1 for a distance that all share).
-        s: distance from x_o to the scattering event, mm, >= 0.
-        mu_i, mu_o: external cosines, [0, 1]; delta_phi: azimuth of the travel out from the travel in, radians.
-    Raises ValueError if an argument is out of range or libraries are mixed.
-    """
-    if medium.n_channels is None:
-        lib, (s, mu_i, mu_o, delta_phi) = _arguments(medium, s=s, mu_i=mu_i, mu_o=mu_o, delta_phi=delta_phi)
-    else:
-        lib, (mu_i, mu_o, delta_phi) = _arguments(medium, mu_i=mu_i, mu_o=mu_o, delta_phi=delta_phi)
-        _, (s, mu_i, mu_o, delta_phi) = broadcast_query(s, mu_i, mu_o, delta_phi)
-        s = _checked(lib, "s", s, s)
-    eta, sigma_t = medium.eta, lib.constant(medium.sigma_t, s)
-    a = lib.maximum(mu_internal(mu_i, eta), TINY)
-    s_i = s * mu_internal(mu_o, eta) / a
-    value = _throughput(lib, medium, mu_i, mu_o, delta_phi) * (mu_i / a) * lib.exp(-sigma_t * (s + s_i))
-    forth, back = s * _sine(lib, mu_o, eta), s_i * _sine(lib, mu_i, eta)
-    x, y = -forth - back * lib.cos(delta_phi), back * lib.sin(delta_phi)
-    return Contribution(lib.constant(medium.sigma_s, s) * value, x, y)

@@ -26,6 +26,7 @@ from halfspace_sss.maps.noisy_maps import (
 )
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.backbone import unwarp
+from halfspace_sss.physics.fresnel import mu_internal
 
 GRID = CellGrid(24, 8)
 COPIES, SET = 16, 8
@@ -82,18 +83,19 @@ def test_the_sum_over_the_plane_is_the_traced_reflectance(references: list[Trace
 
 
 def _single_by_quadrature(m: Medium, groups: Groups, k: int, j: int) -> np.ndarray:
-    """Energies of single scattering in cells from points on the exit ray, by `single_scattering.contribution`."""
+    """Energies of single scattering in cells from points s on the exit ray: its integral over s is the BRDF."""
     log_s, step = np.linspace(-14, 5, 400_000, retstep=True)
     s = np.exp(log_s)
     mu_i, mu_o, delta_phi = groups.mu_i[k], groups.mu_o[k, j], groups.delta_phi[k, j]
-    found = single_scattering.contribution(m, s, mu_i, mu_o, delta_phi)
-    r = np.hypot(found.x, found.y)
-    psi = np.arctan2(-found.y, -found.x) + delta_phi  # of x_o - x_i, from forward; found from the direction of exit
+    a, b = mu_internal(mu_i, m.eta), mu_internal(mu_o, m.eta)
+    forth, back = s * np.sqrt(1 - b * b), s * b / a * np.sqrt(1 - a * a)  # in the plane, along the rays out and in
+    x, y = forth + back * np.cos(delta_phi), -back * np.sin(delta_phi)  # x_o - x_i, x along the direction of exit
+    rate = m.sigma_t * (1 + b / a)
+    value = mu_i * single_scattering.brdf(m, mu_i, mu_o, delta_phi) * rate * np.exp(-rate * s)
+    r, psi = np.hypot(x, y), np.arctan2(y, x) + delta_phi  # from forward
     edges = groups.L[k] * unwarp(errors.library(0.0), radial_edges(groups, GRID)[k])
     turn = np.mod(psi + math.pi, 2 * math.pi)
-    cells = np.histogram2d(
-        r, turn, [edges, np.linspace(0, 2 * math.pi, GRID.n_psi + 1)], weights=found.value * s * step
-    )
+    cells = np.histogram2d(r, turn, [edges, np.linspace(0, 2 * math.pi, GRID.n_psi + 1)], weights=value * s * step)
     return mu_o * cells[0]
 
 

@@ -158,57 +158,17 @@ def test_an_independent_random_walk_agrees_within_4_sigma(g, eta, mu_i):
     assert abs(inside.mean() - np.einsum("i,j,ij", 0.3 * w * radius, w, M)) <= 4 * inside.std() / math.sqrt(n)
 
 
-@pytest.mark.parametrize("eta", ETAS)
-@pytest.mark.parametrize("g", [-0.5, 0.8])
-def test_contributions_over_the_exit_ray_add_to_the_brdf(eta, g):
-    m, mu_i, mu_o, delta_phi = medium(g, eta), 0.8, 0.9, 0.7
-    u = (np.arange(20_000) + 0.5) / 20_000
-    vertex = single.sample_vertex(m, mu_o, u)
-    estimate = np.mean(single.contribution(m, vertex.s, mu_i, mu_o, delta_phi).value / vertex.pdf)
-    assert estimate == pytest.approx(mu_i * single.brdf(m, mu_i, mu_o, delta_phi), rel=1e-6)
-
-
-def test_vertices_follow_their_density_and_lie_under_the_exit_ray():
-    m, u = medium(eta=1.4), np.linspace(0, 0.999, 50)
-    s, depth, pdf = single.sample_vertex(m, 0.4, u)
-    np.testing.assert_allclose(-np.expm1(-2.0 * s), u, atol=1e-14)
-    np.testing.assert_allclose(pdf, 2.0 * (1 - u), rtol=1e-12)
-    np.testing.assert_allclose(depth, s * mu_internal(0.4, 1.4), rtol=1e-14)
-
-
-@pytest.mark.parametrize("eta", [0.9, 1.0, 1.4])
-def test_the_point_of_entry_is_where_the_incident_ray_meets_the_vertex(eta):
-    mu_i, mu_o, delta_phi, s = 0.7, 0.8, 0.9, 0.6
-    sin_i, sin_o = math.sqrt(1 - mu_i**2) / eta, math.sqrt(1 - mu_o**2) / eta
-    a, b = math.sqrt(1 - sin_i**2), math.sqrt(1 - sin_o**2)
-    travel_in = np.array([sin_i * math.cos(delta_phi), -sin_i * math.sin(delta_phi), -a])
-    travel_out = np.array([sin_o, 0, b])
-    vertex = -s * travel_out
-    entry = vertex - vertex[2] / travel_in[2] * travel_in
-    c = single.contribution(medium(0.6, eta), s, mu_i, mu_o, delta_phi)
-    np.testing.assert_allclose([c.x, c.y], entry[:2], rtol=1e-12)
-    cosine = travel_in @ travel_out
-    p = (1 - 0.36) / (4 * math.pi * (1.36 - 1.2 * cosine) ** 1.5)
-    length = s + np.linalg.norm(vertex - entry)
-    T = float(F_t(np.float64(mu_i), eta) * F_t(np.float64(mu_o), eta))
-    assert c.value == pytest.approx(1.6 * T * p * math.exp(-2 * length) * mu_i / (eta**2 * a), rel=1e-12)
-
-
 def test_channels_are_answered_each_for_itself():
     m = Medium([1.0, 2.0, 0.0], [0.1, 0.2, 1.0], [0.0, 0.5, -0.9], 1.3)
-    mu, u = np.array([0.3, 0.8]), np.array([0.2, 0.7])
-    vertex = single.sample_vertex(m, mu, u)
-    whole = [
-        single.brdf(m, mu, 0.5, 0.3), single.exitance(m, mu, 0.6, 0.3), single.reflectance(m, mu), *vertex,
-        single.contribution(m, vertex.s, mu, 0.5, 0.3).value,
-    ]  # fmt: skip
-    for k in range(3):
-        one = m.channel(k)
-        part = [
-            single.brdf(one, mu, 0.5, 0.3), single.exitance(one, mu, 0.6, 0.3), single.reflectance(one, mu),
-            *single.sample_vertex(one, mu, u), single.contribution(one, vertex.s[:, k], mu, 0.5, 0.3).value,
+    mu = np.array([0.3, 0.8])
+
+    def found(medium: Medium) -> list:
+        return [
+            single.brdf(medium, mu, 0.5, 0.3), single.exitance(medium, mu, 0.6, 0.3), single.reflectance(medium, mu)
         ]  # fmt: skip
-        for all_channels, channel in zip(whole, part):
+
+    for k in range(3):
+        for all_channels, channel in zip(found(m), found(m.channel(k))):
             np.testing.assert_allclose(all_channels[..., k], channel, rtol=1e-12)
     assert single.reflectance(m, "diffuse").shape == (3,)
 
@@ -225,21 +185,12 @@ def test_numpy_torch_and_drjit_agree(precision):
     torch = pytest.importorskip("torch")
     llvm = array_types("llvm")
     lanes = llvm.Float if precision is np.float32 else llvm.Float64
-    s, mu_i, mu_o, phi = np.random.default_rng(3).random((4, 32)).astype(precision) * 0.98 + precision(0.01)
+    args = np.random.default_rng(3).random((3, 32)).astype(precision) * 0.98 + precision(0.01)
     m, rtol = medium(0.7, 1.4), 2e-5 if precision is np.float32 else 1e-12
-    calls = (
-        (single.brdf, (mu_i, mu_o, phi)),
-        (single.sample_vertex, (mu_o, s)),
-        (single.contribution, (s, mu_i, mu_o, phi)),
-    )
-    for f, args in calls:
-        want, of_torch, of_drjit = (f(m, *map(kind, args)) for kind in (np.asarray, torch.as_tensor, lanes))
-        if f is single.brdf:
-            want, of_torch, of_drjit = (want,), (of_torch,), (of_drjit,)
-        for a, b, c in zip(want, of_torch, of_drjit):
-            assert a.dtype == precision and b.numpy().dtype == precision and type(c) is lanes
-            np.testing.assert_allclose(b, a, rtol=rtol, atol=rtol * 1e-2)
-            np.testing.assert_allclose(c.numpy(), a, rtol=rtol, atol=rtol * 1e-2)
+    want, of_torch, of_drjit = (single.brdf(m, *map(kind, args)) for kind in (np.asarray, torch.as_tensor, lanes))
+    assert want.dtype == precision and of_torch.numpy().dtype == precision and type(of_drjit) is lanes
+    for found in (of_torch, of_drjit):
+        np.testing.assert_allclose(found.numpy(), want, rtol=rtol, atol=rtol * 1e-2)
 
 
 def test_exitance_agrees_in_torch_and_keeps_the_precision_of_the_query():
@@ -264,8 +215,6 @@ def test_exitance_agrees_in_torch_and_keeps_the_precision_of_the_query():
         (lambda m: single.reflectance(m, [0.5, 2.0]), r"mu_i must be finite and in \[0, 1\], got 2.0"),
         (lambda m: single.reflectance(m, "sunny"), "mu_i must be cosines .*'sunny'"),
         (lambda m: single.moments(m, "diffuse"), "mu_i must be cosines .*'diffuse'"),
-        (lambda m: single.sample_vertex(m, 0.5, 1.5), r"u must be finite and in \[0, 1\], got 1.5"),
-        (lambda m: single.contribution(m, -0.5, 0.5, 0.5, 0.0), r"s must be finite and in \[0, inf\], got -0.5"),
     ],
 )
 @pytest.mark.parametrize("channels", [False, True])
