@@ -13,7 +13,6 @@ from halfspace_sss.measure.reflected_flux import (
     ReducedCoefficients,
     clamped_energy,
     coefficients_of_frequencies,
-    energy_table,
     frequency_reflectance,
     moments,
     profile,
@@ -26,6 +25,6 @@ from halfspace_sss.measure.reflected_flux import (
 
 __all__ = [
     "Integral", "Moments", "Quadrature", "ReciprocityGap", "ReducedCoefficients", "clamped_energy",
-    "coefficients_of_frequencies", "energy_table", "frequency_reflectance", "moments", "profile", "reciprocity_gap",
+    "coefficients_of_frequencies", "frequency_reflectance", "moments", "profile", "reciprocity_gap",
     "reflectance", "reflectance_estimate", "ring_means", "weight_variance",
 ]  # fmt: skip

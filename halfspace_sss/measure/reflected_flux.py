@@ -10,9 +10,9 @@ measures (Cuccia et al. 2009). The integral runs over panels between zeros of J_
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,13 +22,10 @@ from halfspace_sss.checks import check_cosine, check_count, check_edges, roundin
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.measure.quadrature import Angles, Quadrature, cosine_nodes, distances, log_sum
 from halfspace_sss.physics import single_scattering
-from halfspace_sss.physics.fresnel import C_1, F_t, mu_external, mu_internal
+from halfspace_sss.physics.fresnel import mu_external, mu_internal
 from halfspace_sss.physics.medium import Medium, check_numbers, check_scalar_medium
-from halfspace_sss.registry import bssrdf, models
+from halfspace_sss.registry import bssrdf
 from halfspace_sss.tracing.instrument import Readings, checked_frequencies, transformed
-
-if TYPE_CHECKING:
-    import pandas
 
 DEFAULT = Quadrature()
 DIFFUSE_COSINES = 10  # of incidence, on the lattice
@@ -354,54 +351,6 @@ def clamped_energy(model: BSSRDF, mu_i: Incidence = 1.0, quadrature: Quadrature 
         return model.eval(*query) - model.eval_unclamped(*query)
 
     return over_incidence(Angles(added, model.medium, quadrature, model.eval), mu_i, quadrature)
-
-
-def energy_table(
-    media: Mapping[str, Medium], names: Iterable[str] | None = None, mu_i: Iterable[Incidence] = (1.0, 0.3, "diffuse"),
-    quadrature: Quadrature | None = None,
-) -> pandas.DataFrame:  # fmt: skip
-    """Reflectance of models over media against what can enter, where models leave [0, 1].
-
-    Args:
-        media: media by name.
-        names: registered models, by default all.
-        mu_i: incidences as in `reflectance`.
-
-    Returns:
-        One row per medium, channel, model and incidence: `reflectance` at the model's own orders, `total` with the
-        single order added to models of "multiple", `limit` = T_12(mu_i) (diffuse: 1 - 2 C_1(1/eta)), `inside`, whether
-        total lies in [0, limit] to 1e-6, and `note`, why a model refuses the medium (NaN, and None for `inside`).
-    """
-    import pandas
-
-    rows = []
-    for medium_name, medium in media.items():
-        for name in models() if names is None else names:
-            for incidence in mu_i:
-                rows += _energy_rows(medium_name, medium, name, incidence, quadrature)
-    return pandas.DataFrame(rows)
-
-
-def _energy_rows(
-    medium_name: str, medium: Medium, name: str, mu_i: Incidence, quadrature: Quadrature | None
-) -> list[dict[str, object]]:
-    n = medium.n_channels or 1
-    try:
-        model = bssrdf(name, medium)
-        orders, note = model.orders, ""
-        R = np.broadcast_to(reflectance(model, mu_i, quadrature=quadrature), n)
-    except ValueError as error:
-        if name not in models():
-            raise
-        orders, note, R = "", str(error), np.full(n, np.nan)
-    total = R + (single_scattering.reflectance(medium, mu_i) if orders == "multiple" else 0.0)
-    limit = 1 - 2 * C_1(1 / medium.eta) if isinstance(mu_i, str) else float(F_t(np.float64(mu_i), medium.eta))
-    inside = [None if note else bool(-1e-6 <= t <= limit + 1e-6) for t in total]
-    return [
-        {"medium": medium_name, "channel": k, "model": name, "orders": orders, "mu_i": mu_i, "reflectance": R[k],
-         "total": total[k], "limit": limit, "inside": inside[k], "note": note}
-        for k in range(n)
-    ]  # fmt: skip
 
 
 def weight_variance(model: BSSRDF, mu_o: float = 0.8, n: int = 1 << 14, seed: int = 0) -> Values:

@@ -206,23 +206,6 @@ def test_a_model_that_does_not_clamp_has_no_clamped_energy():
     assert measure.clamped_energy(Tilted(Medium([1.0, 2.0], 0.1)), "diffuse").tolist() == [0, 0]
 
 
-def test_the_energy_table_tells_where_models_leave_the_physical_range():
-    media = {"clear": Medium.from_albedo([0.5, 1.0], 1.0, 0.0, 1.0)}
-    table = measure.energy_table(media, ["standard_dipole", "directional_dipole"])
-    assert len(table) == 2 * 2 * 3
-    directional = table[(table.model == "directional_dipole") & (table.channel == 1) & (table.mu_i == 1.0)].iloc[0]
-    assert directional.limit == 1 and directional.total > 1.2 and not directional.inside
-    standard = table[(table.model == "standard_dipole") & (table.channel == 0) & (table.mu_i == 1.0)].iloc[0]
-    assert standard.total == pytest.approx(standard.reflectance + single.reflectance(media["clear"], 1.0)[0])
-    assert standard.inside and standard.orders == "multiple"
-
-
-def test_the_energy_table_notes_a_model_that_refuses_the_medium():
-    table = measure.energy_table({"back": Medium(1.0, 0.1, -0.3)}, ["forward_scattering_dipole"], [1.0])
-    row = table.iloc[0]
-    assert math.isnan(row.total) and row.inside is None and "g must be" in row.note
-
-
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -234,7 +217,6 @@ def test_the_energy_table_notes_a_model_that_refuses_the_medium():
         (lambda s: measure.profile(s, 1.0, -0.1), r"mu_i must be in \[0, 1\], got -0.1"),
         (lambda s: measure.moments(s, 2.0), r"mu_i must be in \[0, 1\], got 2.0"),
         (lambda s: measure.reciprocity_gap(s, 0), "n must be >= 1, got 0"),
-        (lambda s: measure.energy_table({"m": s.medium}, ["no_such"]), "model must be one of .*'no_such'"),
         (lambda s: Quadrature(per_decade=1), "per_decade must be a whole number >= 4, got 1"),
         (lambda s: Quadrature(n_azimuth=7), "n_azimuth must be even, got 7"),
         (lambda s: Quadrature(n_mu=1), "n_mu must be a whole number >= 2, got 1"),
