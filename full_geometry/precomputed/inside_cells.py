@@ -17,8 +17,10 @@ neighbour.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -32,9 +34,11 @@ from halfspace_sss.arrays import aligned
 BRICK = 4  # cells along its edge: its 64 cells are the bits of a number
 MOST_BRICKS, MOST_SLOTS = 2**24, 5 * 2**18  # of one object: h grows until it has no more
 POINTS = 6, 24  # of the surface, for each h² of it, that find the bricks and the cells it cuts
+MOST_MET, STEP = 64, 1e-2  # surfaces that a ray tells apart, and how far apart they are, over the distance of rays
 MARGIN = 0.25  # of h, by which a point of the surface reaches into the next cells
 COLUMNS = 7, 4  # along each edge of a cell: their square measures its inside; the latter of FINE cells and more
 FINE, AT_ONCE = 2**15, 2**14
+RAYS = 2**20  # at once
 SMALLEST = 0.25  # part of a cell, below which it shares the fit of a neighbour
 RIDGE = 0.02  # of the variance of a whole cell, added to that of the inside: slopes of a sliver are unknown
 PAIRS = ((0, 0), (0, 1), (0, 2), (0, 3), (1, 1), (2, 2), (3, 3), (1, 2), (1, 3), (2, 3))  # of the moments
@@ -100,14 +104,13 @@ class InsideCells:
 
     @classmethod
     def of(
-        cls, media: WalkMedia, k: int, points: tuple[SurfaceParts, SurfaceParts], box: tuple[np.ndarray, np.ndarray],
-        h: float, depths: tuple[float, float],
+        cls, media: WalkMedia, k: int, points: SurfaceParts, box: tuple[np.ndarray, np.ndarray], h: float,
+        depths: tuple[float, float],
     ) -> InsideCells:  # fmt: skip
         """The cells of object k.
 
         Args:
-            points: so many uniform over its surface for each square of a scene unit, part by part; and over those of
-                shapes in it.
+            points: so many uniform over its surface for each square of a scene unit, part by part.
             box: its least and largest coordinates.
             h: edge of a cell, from `cell_edge`.
             depths: below the surface, beyond which cells are coarse, and beyond which there are none, scene units.
@@ -115,12 +118,13 @@ class InsideCells:
         # ---- bricks that surfaces cut and those near the own, and cells of the former that they cut
         counts = brick_counts(box, h)
         low = 0.5 * (box[0] + box[1]) - 0.5 * BRICK * counts * h
-        outer, inner = (_crossed_bricks(each, low, h, counts) for each in points)
+        held = partial(_points_held, media, k, box)
+        outer, inner = (_crossed_bricks(each, low, h, counts) for each in (points, held))
         apart = distance_transform_cdt(~outer.reshape(counts[::-1]), "chessboard").ravel()
         near, far = (np.ceil(min(depth / (BRICK * h), 1e6)) for depth in depths)
         surface = outer | inner
         bricks = np.flatnonzero(surface & (apart <= far))
-        axes = _crossed_cells(points, low, h, counts, bricks)
+        axes = _crossed_cells((points, held), low, h, counts, bricks)
 
         # ---- what of them is inside; of the cut cells by measurement
         inside, whole = _inside(media, k, (surface, bricks, axes >= 0), low, h, counts)
@@ -318,6 +322,33 @@ def _inverse(C: np.ndarray) -> np.ndarray:
     return rows / (C[:, 0] * rows[:, 0]).sum(axis=1)[:, None, None]
 
 
+def _points_held(media: WalkMedia, k: int, box: tuple[np.ndarray, np.ndarray], density: float) -> Iterator[EntrySample]:
+    """Points of the surfaces of shapes in object k, of this density across three axes: where rays meet them."""
+    if media.holes is None:
+        return
+    size, root, low = box[1] - box[0], math.sqrt(density), mi.Point3f(*(opaque(v) for v in box[0]))
+    for axis in range(3):
+        # ---- a lattice of rays along the axis, part by part
+        n, m = (math.ceil(size[(axis + a) % 3] * root) for a in (1, 2))
+        for first in range(0, n * m, RAYS):
+            i, across = dr.arange(mi.UInt32, min(RAYS, n * m - first)), dr.opaque(mi.UInt32, n)
+            i += dr.opaque(mi.UInt32, first)
+            place = mi.Float(0), *((mi.Float(v) + 0.5) * opaque(1 / root) for v in (i % across, i // across))
+            o = mi.Point3f(*(place[(a - axis) % 3] for a in range(3))) + low
+            d = mi.Vector3f(*(opaque(float(a == axis)) for a in range(3)))
+
+            # ---- all that they meet inside the box
+            going = dr.full(mi.Bool, True, dr.width(i))
+            for _ in range(MOST_MET):
+                si = media.instance_scene.intersect(media.inner.scene, mi.Ray3f(o, d), mi.RayFlags.Minimal, going)
+                going &= si.is_valid() & (si.p[axis] < opaque(box[1][axis]))
+                if not dr.any(going):
+                    break
+                p = dr.select(going & (media.inner.around(si) == k), si.p, low - opaque(np.max(size)))
+                yield EntrySample(p, mi.Normal3f(si.n), mi.Normal3f(si.n), mi.Float(1), mi.UInt32(0))
+                o = dr.select(going, si.p + d * opaque(STEP / root), o)
+
+
 def _crossed_bricks(points: SurfaceParts, low: np.ndarray, h: float, counts: np.ndarray) -> np.ndarray:
     """Which bricks the surface may cut: points reach them."""
     crossed = dr.zeros(mi.Bool, int(counts.prod()))
@@ -374,36 +405,37 @@ def _points(x: np.ndarray, low: np.ndarray, h: float) -> mi.Point3f:
     return of_rows(mi.Point3f, low + h * x)
 
 
-def _own_hit(media: WalkMedia, k: mi.Int32, ray: mi.Ray3f) -> tuple[mi.Float, mi.Bool, mi.Bool]:
-    """Distance to a surface that bounds the inside of object k along a ray, whether one is met, and whether the ray
-    leaves the inside there."""
+def _ahead(media: WalkMedia, k: mi.Int32, ray: mi.Ray3f) -> tuple[mi.Float, mi.Bool, mi.Bool]:
+    """Distance to the next surface that bounds the inside of object k along a ray, whether there is one, and whether
+    the ray is inside up to there: the next boundary of the object lets it out, and none of a shape in it does."""
     scene = (media.inner or media).scene
 
-    def nearer(t: mi.Float, found: mi.Bool, leaves: mi.Bool, going: mi.Bool) -> tuple:
-        si = media.instance_scene.intersect(
-            scene, mi.Ray3f(ray.o + ray.d * t, ray.d), mi.RayFlags.Minimal, active=going
-        )
-        hit, along = going & si.is_valid(), dr.dot(si.n, ray.d)
-        own = hit & ((media.index_of(si, hit) if media.inner else media.met(si, k)) == k)
-        out = along * media.side(k, si.prim_index) > 0
-        if media.inner is not None:  # shapes in it, which the ray leaves the inside to enter
+    def nearer(t: mi.Float, first: mi.Float, inside: mi.Bool, met: mi.UInt32, going: mi.Bool) -> tuple:
+        # ---- the next surface; its first meeting with the object, bit 1 of `met`, tells whether it was in there
+        here = mi.Ray3f(ray.o + ray.d * t, ray.d)
+        si = media.instance_scene.intersect(scene, here, mi.RayFlags.Minimal, active=going)
+        hit, along, t = going & si.is_valid(), dr.dot(si.n, ray.d), t + si.t
+        bounds = own = hit & ((media.met(si, k) if media.inner is None else media.index_of(si, hit)) == k)
+        inside &= ~own | (met & 1 != 0) | (along * media.side(k, si.prim_index) > 0)
+        met |= dr.select(own, mi.UInt32(1), 0)
+
+        # ---- that with a closed shape in it, bit 2, tells whether it was not
+        last = own
+        if media.inner is not None:
+            held = hit & (media.inner.around(si) == k)
             number = media.inner.instance_table.number(si, hit)
-            side = dr.gather(mi.Float, media.holes.side, dr.maximum(number, 0))
-            out = dr.select(own, out, along * side <= 0)
-            own |= hit & (media.inner.around(si) == k)
-        step = media.row("rounding", k)
-        t = dr.select(hit, t + si.t + dr.select(own, 0, step), t)
-        return t, found | own, dr.select(own, out, leaves), hit & ~own
+            side = dr.gather(mi.Float, media.holes.side, dr.maximum(number, 0), held)
+            inside &= ~held | (met & 2 != 0) | (along * side <= 0)
+            met |= dr.select(held & (side != 0), mi.UInt32(2), 0)
+            bounds, last = own | held, met == 3
+        first = dr.select(bounds & ~dr.isfinite(first), t, first)
+        return dr.select(hit, t + media.row("rounding", k), t), first, inside, met, hit & ~last
 
     lanes = dr.width(ray.o)
-    start = (
-        dr.zeros(mi.Float, lanes),
-        dr.full(mi.Bool, False, lanes),
-        dr.full(mi.Bool, False, lanes),
-        dr.full(mi.Bool, True, lanes),
-    )
-    t, found, leaves, _ = dr.while_loop(start, lambda t, f, o, going: going, nearer, label="own surface")
-    return t, found, leaves
+    t, first, met = dr.zeros(mi.Float, lanes), dr.full(mi.Float, dr.inf, lanes), dr.full(mi.UInt32, 0, lanes)
+    state = t, first, dr.full(mi.Bool, True, lanes), met, dr.full(mi.Bool, True, lanes)
+    _, first, inside, met, _ = dr.while_loop(state, lambda *state: state[-1], nearer, label="surfaces ahead")
+    return first, dr.isfinite(first), inside & (met & 1 != 0)
 
 
 def _starts_inside(media: WalkMedia, k: int, p: mi.Point3f) -> np.ndarray:
@@ -413,8 +445,8 @@ def _starts_inside(media: WalkMedia, k: int, p: mi.Point3f) -> np.ndarray:
     for axis in range(3):
         d = dr.normalize(mi.Vector3f(*(opaque(1.0 if a == axis else 0.0137 * (a + 1)) for a in range(3))))
         number = dr.opaque(mi.Int32, k, dr.width(p))
-        _, found, leaves = _own_hit(media, number, mi.Ray3f(p, d + dr.zeros(mi.Vector3f, dr.width(p))))
-        votes = votes + np.array(found & leaves).astype(int)
+        _, _, inside = _ahead(media, number, mi.Ray3f(p, d + dr.zeros(mi.Vector3f, dr.width(p))))
+        votes = votes + np.array(inside).astype(int)
     return votes >= 2
 
 
@@ -446,9 +478,9 @@ def _measure(
         # ---- its segments inside: the next surface tells where one ends, and on which side it was
         def segment(begin: mi.Float, sums: list[mi.Float]) -> tuple:
             ray = mi.Ray3f(centre + (start + d * begin) * edge, d)
-            t, found, leaves = _own_hit(media, number, ray)
+            t, found, inside = _ahead(media, number, ray)
             end = dr.select(found, dr.minimum(begin + t / edge, 1), 1)
-            length = dr.select(found & leaves, end - begin, 0)
+            length = dr.select(inside, end - begin, 0)
             # Simpson's rule is exact for products of two coordinates
             at = [start + d * x for x in (begin, 0.5 * (begin + end), end)]
             values = []

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.geometry.instances import InstanceTable, InstanceTransform
+from full_geometry.geometry.instances import InstanceTransform
 from full_geometry.geometry.light_points import uniform_entries
 from full_geometry.geometry.points import EntrySample, cosine_above, cosine_density, lift, opaque
 from full_geometry.geometry.rounding import blocked, ray_from
-from full_geometry.geometry.shape import Geometry
 from full_geometry.walk.media import WalkMedia
 
 BY_COSINE = 0.25  # of the directions to emitters
@@ -102,15 +101,10 @@ def to_world(media: WalkMedia, k: int) -> np.ndarray:
 
 def entries(media: WalkMedia, k: int, u: list[mi.Float]) -> EntrySample:
     """Points uniform over the surface of object k, in an instance over that in its group; the weight is 1 / density."""
-    return points_of(media.instance_table, media.objects, k, u)
-
-
-def points_of(table: InstanceTable, shapes: Sequence[Geometry], k: int, u: list[mi.Float]) -> EntrySample:
-    """The same of thing k of a table with these shapes."""
-    kind = int(table.kind[k])
-    found = uniform_entries(shapes[kind], u[0], mi.Point2f(u[1], u[2]))
-    if table.groups[kind] is None:
+    kind = int(media.instance_table.kind[k])
+    found = uniform_entries(media.objects[kind], u[0], mi.Point2f(u[1], u[2]))
+    if media.instance_table.groups[kind] is None:
         return found
-    M = table.to_world(kind)[k - int(table.first[kind])]
+    M = to_world(media, k)
     columns = [[mi.Vector3f(*(opaque(v) for v in column)) for column in m[:3].T] for m in (M, np.linalg.inv(M))]
     return InstanceTransform(*columns, mi.Float(0)).entry_to_world(found)

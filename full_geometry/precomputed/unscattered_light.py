@@ -28,7 +28,7 @@ that: phase functions are cut after q_2 = g² instead, and MOST_TRUNCATED bounds
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import zip_longest
@@ -42,7 +42,7 @@ from full_geometry.geometry.instances import corners, ends_of
 from full_geometry.geometry.points import EntrySample, opaque, sided
 from full_geometry.precomputed.forward_scattering import kept_forward, quadratic_part, split_extinction, truncated
 from full_geometry.precomputed.inside_cells import RIDGE, CellIndex, InsideCells, cell_edge
-from full_geometry.precomputed.lit_points import bend, entries, lit_points, multiples, points_of, to_world
+from full_geometry.precomputed.lit_points import bend, entries, lit_points, multiples, to_world
 from full_geometry.precomputed.scattered_light import ScatteredLight
 from full_geometry.precomputed.transport_matrix import R_2
 from full_geometry.walk.media import WalkMedia
@@ -253,7 +253,7 @@ def inside_cells_of(
             results.append(cells[k])
             continue
         points = partial(_surface_points, media, k, _extent(media, k)[0])
-        results.append(InsideCells.of(media, k, (points, partial(_points_of_holes, media, k)), box, h, depths))
+        results.append(InsideCells.of(media, k, points, box, h, depths))
     return results
 
 
@@ -280,28 +280,12 @@ def _extent(media: WalkMedia, k: int) -> tuple[float, float]:
 
 def _surface_points(media: WalkMedia, k: int, area: float, density: float) -> Iterator[EntrySample]:
     """Points over the surface of object k in order along its faces, of this density, by parts of MOST_POINTS."""
-    return _even_points(partial(entries, media, k), density * area)
-
-
-def _points_of_holes(media: WalkMedia, k: int, density: float) -> Iterator[EntrySample]:
-    """The same over the surfaces of shapes in object k."""
-    if media.inner is None:
-        return
-    table, around = media.inner.instance_table, np.array(media.inner.tables["around"])
-    for number in np.flatnonzero(around == k):
-        drawn = partial(points_of, table, media.holes.shapes, int(number))
-        area = float(np.mean(np.array(next(_even_points(drawn, 1)).weight)))
-        yield from _even_points(drawn, density * area)
-
-
-def _even_points(drawn: Callable[[list[mi.Float]], EntrySample], number: float) -> Iterator[EntrySample]:
-    """So many points of a surface in order along its faces, at least FEWEST_POINTS."""
-    n = max(number, FEWEST_POINTS)
+    n = max(density * area, FEWEST_POINTS)
     parts = math.ceil(n / MOST_POINTS)
     width = math.ceil(n / parts)
     for part in range(parts):
         u = (dr.arange(mi.Float, width) + 0.5) * opaque(1 / (width * parts)) + opaque(part / parts)
-        yield drawn([dr.minimum(u, 1 - 2**-24), *multiples(R_2, (0.5, 0.5), width, part * width)])
+        yield entries(media, k, [dr.minimum(u, 1 - 2**-24), *multiples(R_2, (0.5, 0.5), width, part * width)])
 
 
 def _extinction(media: WalkMedia, kind: int) -> np.ndarray:

@@ -458,12 +458,13 @@ class WalkMedia:
             return None
         table, shapes = self.inner.instance_table, list(self.objects)
         for shape in table.shapes[len(shapes) :]:
+            try:
+                shape.surface_area()
+            except RuntimeError:  # Mitsuba's, of curves
+                raise ValueError(f"a shape must have an area, got {name_of(shape)}") from None
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # a sheet inside an object is no mistake
-                try:
-                    shapes.append(analyse_shape(shape, self.scene))
-                except RuntimeError:  # of Mitsuba
-                    raise ValueError(f"a shape must have an area, got {name_of(shape)}") from None
+                shapes.append(analyse_shape(shape, self.scene))
         for each in shapes:
             if each.signs is not None:
                 raise ValueError(f"faces must point to one side, got both of {each.name}")

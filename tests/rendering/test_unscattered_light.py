@@ -123,6 +123,14 @@ def test_cells_leave_out_what_lies_inside_an_object(kind: str) -> None:
     assert (M[:, 0, 0] * edge**3).sum() == pytest.approx(volume, rel=2e-3)
 
 
+def test_cells_leave_out_the_part_of_an_eye_that_lies_inside_a_ball() -> None:
+    """Balls of radii R and r, d apart, share pi (R + r - d)² (d² + 2 d (R + r) - 3 (R - r)²) / 12 d."""
+    eye = {**_ball(2.0, center=[0.0, 0.0, 5.0]), "bsdf": {"type": "diffuse"}}
+    _, _, edge, M = _moments(_cells(_ball(), held=eye))
+    shared = np.pi * 2**2 * (5**2 + 2 * 5 * 7 - 3 * 3**2) / (12 * 5)
+    assert (M[:, 0, 0] * edge**3).sum() == pytest.approx(4 / 3 * np.pi * 125 - shared, rel=5e-4)
+
+
 def test_cells_know_the_second_moments_of_a_ball() -> None:
     """∫ x² of a ball is 4/15 pi R^5."""
     _, centre, edge, M = _moments(_cells(_ball()))
