@@ -1,8 +1,7 @@
-"""Tables of models of one object, and of base models that its network may begin with, at equal CPU time."""
+"""Tables of models of one object, and of ways of drawing its entries, at equal CPU time."""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from tempfile import TemporaryDirectory
@@ -30,17 +29,15 @@ from full_geometry.geometry.points import (
     turned,
 )
 from full_geometry.learning import model_errors
-from full_geometry.learning.model_errors import ExitTruth, RadianceError, compare, measure, reference, transport_of
-from full_geometry.learning.network_fitting import STANDARD
-from full_geometry.learning.training import Trained, train, train_unattended
+from full_geometry.learning.model_errors import ExitTruth, RadianceError, compare, transport_of
+from full_geometry.learning.training import train_unattended
 from full_geometry.objects.objects import TranslucentObject, object_of
 from full_geometry.transport.exit_pairs import EntryProposals, Numbers
 from full_geometry.transport.half_space import HalfSpaceProposals
 from full_geometry.transport.one_object import HalfSpace
 from full_geometry.transport.patches import AREA_SHARE, LearntProposals, PatchTable
-from full_geometry.transport.storing import KIND, Learnt
+from full_geometry.transport.storing import Learnt
 from halfspace_sss.checks import check_choice, check_count
-from halfspace_sss.neural.store import load_weights
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 if TYPE_CHECKING:
@@ -122,61 +119,6 @@ def paper_errors(
     check_choice("points", points, POINTS)
     check_count("repeats", repeats, 2)
     return compare(estimate(obj, net, truth.exits, points, repeats, seed), truth.truth)
-
-
-# ----------------------------------------------------------------------------------------------------
-# The table of base models: errors of one object against CPU time, by the model that its network corrects.
-
-BASE_MODELS = (STANDARD.base_model, "neural_shape")
-TIMES = ((0.0, 1.0), (1 / 12, 1 / 4), (1 / 3, 1 / 2), (1.0, 1.0))  # shares of the time, and of a chunk of the recipe
-
-
-def base_model_table(
-    scene: mi.Scene, name: str | None = None, *, seconds: float = 60.0, exits: int = 256, walks: int = 4096,
-    samples: int = 4096, seed: int = 0, progress: Callable[[str, int, int], object] | None = None,
-) -> pandas.DataFrame:  # fmt: skip
-    """Rows of base model, planned and spent CPU seconds, steps, channel, light, error with its error, ratio of means.
-
-    Spent is all of a training but the truth: the pilot and the kernels that it compiles, data and fit.
-
-    Args:
-        scene: with the object.
-        name: its id; may be left out where there is one.
-        seconds: of CPU time of the longest training; the others have a third, a twelfth and none of it.
-        exits, walks, samples: of the truth and of the models.
-        seed: of everything.
-        progress: called with (what, done, total).
-    """
-    import pandas
-
-    obj, rows = object_of(scene, None, None, name), []
-    truth = reference(obj, exits, walks, seed)
-    runs = [(base_model, *time) for base_model in BASE_MODELS for time in TIMES]
-    for k, (base_model, share, part) in enumerate(runs):
-        if progress:
-            progress(f"{base_model}, {share * seconds:.3g} s", k, len(runs))
-        learnt, about = _learnt(obj, base_model, share * seconds, part, seed)
-        proposals = EntryProposals(obj, HalfSpace(obj, STANDARD.base_model))
-        proposals = proposals.with_patches(learnt.sampler if share else None)
-        errors = measure(obj, learnt.model, proposals, truth=truth, samples=samples, seed=seed)
-        rows += [{"base_model": base_model, "planned": share * seconds, **about, **row._asdict()} for row in errors]
-    return pandas.DataFrame(rows)
-
-
-def _learnt(
-    obj: TranslucentObject, base_model: str, seconds: float, part: float, seed: int
-) -> tuple[Trained, dict[str, float]]:
-    """A training with chunks of a part of those of the recipe; what it took."""
-    recipe = replace(STANDARD.with_base_model(base_model), chunk=int(STANDARD.chunk * part))
-    with TemporaryDirectory() as folder:
-        if seconds == 0:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                result = train(obj, seconds=0, recipe=recipe, seed=seed, folder=folder)
-            return result, {"seconds": 0.0, "steps": 0}
-        learnt = train_unattended(obj, folder, cpu_seconds=seconds, seed=seed, recipe=recipe)
-        record = load_weights(learnt.path, KIND)[1]
-        return learnt, {"seconds": record["seconds"], "steps": record["steps"]}
 
 
 # ----------------------------------------------------------------------------------------------------

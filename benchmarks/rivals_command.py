@@ -1,4 +1,4 @@
-"""The command `rivals`: tables of samplers, of models and of base models of one object, at equal CPU time."""
+"""The command `rivals`: tables of samplers and of models of one object, at equal CPU time."""
 
 from __future__ import annotations
 
@@ -18,26 +18,23 @@ if TYPE_CHECKING:
     import pandas
 
 
-KEYS = {"errors": ["model"], "base_models": ["base_model", "planned", "seconds", "steps"]}  # of errors of a training
-TABLES = ("errors", "samplers", "base_models")
+TABLES = ("errors", "samplers")
 
 
 def rivals_command(
     scene: Annotated[Path, typer.Option(help="Mitsuba XML file with the object.")],
     object: ObjectId = None,
     table: Annotated[
-        list[str] | None, typer.Option(help="errors, samplers or base_models; repeat for several.", show_default="all")
+        list[str] | None, typer.Option(help="errors or samplers; repeat for both.", show_default="all")
     ] = None,
-    seconds: Annotated[
-        float, typer.Option(help="CPU time of each training with its data; for base_models, of the longest.")
-    ] = 60.0,
+    seconds: Annotated[float, typer.Option(help="CPU time of each training with its data.")] = 60.0,
     samples: Annotated[int, typer.Option(help="Samples of each exit, for errors and variances.", parser=whole)] = 2048,
     seed: Annotated[int, typer.Option(help="Seed of random numbers.", parser=whole)] = 0,
     define: Define = None,
     variant: Variant = "llvm_ad_rgb",
     out: OutFolder = Path("rivals"),
 ) -> None:
-    """Compare ways of drawing entries by variance x time, models and base models by errors, by CPU time."""
+    """Compare ways of drawing entries by variance x time, and models by errors, at equal CPU time."""
     chosen = table or list(TABLES)
     for name in chosen:
         check_choice("table", name, TABLES)
@@ -54,7 +51,7 @@ def rivals_command(
         with Bar(name) as bar:
             frame = _made(name, loaded, object, seconds, samples, seed, bar)
         files[out / f"{name}.csv"] = frame.to_csv(index=False, lineterminator="\n")
-        files[out / f"{name}.md"] = markdown(_errors_wide(frame, KEYS[name]) if name in KEYS else frame)
+        files[out / f"{name}.md"] = markdown(_errors_wide(frame) if name == "errors" else frame)
     write_together(files)
     for path, text in files.items():
         if path.suffix == ".md":
@@ -76,20 +73,20 @@ def _made(
     def show(what: str, done: int, total: int) -> None:
         bar.show(done, total, what)
 
-    if table in KEYS:
-        make = {"errors": rivals.error_table, "base_models": rivals.base_model_table}[table]
-        return make(scene, name, seconds=seconds, walks=samples, samples=samples, seed=seed, progress=show)
+    if table == "errors":
+        return rivals.error_table(
+            scene, name, seconds=seconds, walks=samples, samples=samples, seed=seed, progress=show
+        )
     with TemporaryDirectory() as folder:
         learnt = train_unattended(object_of(scene, None, None, name), folder, cpu_seconds=seconds, seed=seed)
     return sampler_table(learnt, FlowRecipe(seconds=0.5 * seconds), samples=samples, seed=seed, progress=show)
 
 
-def _errors_wide(table: pandas.DataFrame, keys: list[str]) -> pandas.DataFrame:
-    """A row for each training, told by the columns `keys`; a column for each channel and light: error ± its own, %."""
+def _errors_wide(table: pandas.DataFrame) -> pandas.DataFrame:
+    """A row for each model; a column for each channel and light: error ± its own, %."""
     texts = table.assign(
         what=[f"{light}, channel {channel}" for light, channel in zip(table["light"], table["channel"])],
         text=[f"{100 * a:.2g} ± {100 * b:.1g}" for a, b in zip(table["error"], table["standard_error"])],
     )
-    wide = texts.pivot(index=keys, columns="what", values="text")
-    rows = table[keys].drop_duplicates().set_index(keys).index
-    return wide.loc[rows, list(dict.fromkeys(texts["what"]))].reset_index()
+    wide = texts.pivot(index="model", columns="what", values="text")
+    return wide.loc[table["model"].unique(), list(dict.fromkeys(texts["what"]))].reset_index()

@@ -35,12 +35,6 @@ def train_object(
     model: Annotated[
         str | None, typer.Option(help="Name of a model that learns objects.", show_default="full_geometry")
     ] = None,
-    base_model: Annotated[
-        str | None,
-        typer.Option(
-            help="neural_shape or a half-space model, which the network corrects.", show_default="better_dipole"
-        ),
-    ] = None,
 ) -> None:
     """Train networks of objects of a scene for `render`, and print their errors."""
     need_torch()
@@ -61,7 +55,6 @@ def train_object(
         results = results.elsewhere() if executor else results
         of, parts = (scene.absolute() if executor else scene, parameters, on.variant, model), {}
         how = {"seconds": seconds, "target_error": results.target_error, "seed": results.seed, "folder": results.out}
-        how |= {"base_model": base_model} if base_model is not None else {}
         for name in dict.fromkeys(object or (None,)):
             work = results.work / name if results.work and len(object or ()) > 1 else results.work
             parts[name or "object"] = (of, {**how, "object": name, "work": work}, None if executor else bar)

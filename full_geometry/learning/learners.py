@@ -76,7 +76,7 @@ class Learner(Protocol):
     ) -> LearntObject:
         """Learn an object and write its weights; walks of a camera that is given are data too.
 
-        `plan` has `seconds`, `target_error` and `seed`, and may have `base_model`, the model that the network corrects.
+        `plan` has `seconds`, `target_error` and `seed`.
         """
 
     def untrained(self, scene: mi.Scene) -> list[str]:

@@ -12,14 +12,12 @@ import numpy as np
 import torch
 from torch import nn
 
-from full_geometry.transport.any_shape import KIND as SHAPES
 from full_geometry.transport.exit_pairs import ENOUGH, Pairs, PairSource
 from full_geometry.transport.features import Terms, entering, n_pair, reverse
 from full_geometry.transport.one_object import BOUND
 from full_geometry.transport.patches import Patches
-from halfspace_sss.checks import check_choice, check_count, check_interval
+from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.neural.training.fit import Descent, cosine, gone_on_with, torch_threads, warm_up, write_checkpoint
-from halfspace_sss.registry import models
 
 # ---- Where networks are fitted: beside the walks that are their data -------------------------------
 
@@ -200,7 +198,6 @@ LEAST = 0.05  # chance of a proposal: f moves while the chunk is used
 PATCH_HIDDEN, PATCH_BATCH = (64, 32), 1024
 ALPHA_HIDDEN = (32, 16)
 REFINING = 4  # parts of rate and chunk where a training starts from other weights
-RATES = {SHAPES: 1.5e-3}  # by base model: noise of walks leads large steps away from a near one
 
 
 @dataclass(frozen=True)
@@ -213,7 +210,6 @@ class Recipe:
         rate: largest learning rate.
         chunk: walks that are kept of those made at once, with twice as many proposals.
         reuse: times that each is used.
-        base_model: S_0, which the network corrects: the name of a half-space model, or `neural_shape`.
     """
 
     width: int = 48
@@ -222,17 +218,11 @@ class Recipe:
     rate: float = 6e-3
     chunk: int = 2**17
     reuse: int = 2
-    base_model: str = "better_dipole"
 
     def __post_init__(self) -> None:
         for name in ("width", "depth", "batch", "chunk", "reuse"):
             check_count(name, getattr(self, name), 1)
         check_interval("rate", self.rate, 1e-8, 1.0)
-        check_choice("base_model", self.base_model, (SHAPES, *models()))
-
-    def with_base_model(self, name: str) -> Recipe:
-        """The same for another base model, with the rate that suits it."""
-        return replace(self, base_model=name, rate=RATES.get(name, self.rate))
 
     def refining(self) -> Recipe:
         """The same for weights that begin near: smaller steps, and chunks of a fraction of a second."""

@@ -33,7 +33,7 @@ from full_geometry.scenes.camera_walks import TRIAL, CameraWalks
 from full_geometry.transport import storing
 from full_geometry.transport.exit_pairs import EntryProposals, Pairs, PairSource, WalkExits, shuffled
 from full_geometry.transport.features import n_local, n_pair, n_side
-from full_geometry.transport.one_object import FullGeometry
+from full_geometry.transport.one_object import BASE_MODEL, FullGeometry, HalfSpace
 from full_geometry.transport.patches import Patches, PatchSampler, cluster
 from full_geometry.transport.storing import frame_of, identify
 from halfspace_sss.arrays import aligned
@@ -209,11 +209,10 @@ class TrainingPlan:
     """How long, how large and from where a training goes.
 
     Args:
-        seconds: for data, fit and validation, after the kernels are compiled; 0 gives the base model, with a warning.
+        seconds: for data, fit and validation, after the kernels are compiled; 0 gives the half-space, with a warning.
         target_error: stop once the largest error under constant light has come down to it.
         recipe: sizes and rates.
         chunks: number of chunks instead of a plan by time.
-        base_model: `neural_shape` or a half-space model, with its rate; by default the recipe's.
         refine: begin from the weights of the same shape with the medium that is most alike, see `storing.nearest`.
     """
 
@@ -222,7 +221,6 @@ class TrainingPlan:
     seed: int = 0
     recipe: Recipe = STANDARD
     chunks: int | None = None
-    base_model: str | None = None
     refine: bool = False
 
     def __post_init__(self) -> None:
@@ -273,14 +271,13 @@ def train(
         check_folder(work)
     if not any(float(m.sigma_s) > 0 for m in obj.media):
         raise ValueError("medium must scatter in at least one channel to be learnt, got sigma_s 0 in all")
-    recipe = how.recipe if how.base_model is None else how.recipe.with_base_model(how.base_model)
-    start = storing.nearest(obj, asdict(recipe), folder) if how.refine else None
+    start = storing.nearest(obj, asdict(how.recipe), folder) if how.refine else None
     if how.refine and start is None:
         raise ValueError(f"refine must have weights of the same shape and a medium alike in {folder}, got none")
-    recipe = recipe if start is None else recipe.refining()
+    recipe = how.recipe if start is None else how.recipe.refining()
     run = _ObjectTraining(obj, recipe, int(how.seed), Path(work) if work else None, camera, start)
     if how.seconds == 0:
-        warnings.warn(f"an object that is trained for 0 seconds is rendered by {recipe.base_model}", stacklevel=2)
+        warnings.warn(f"an object that is trained for 0 seconds is rendered by {BASE_MODEL}", stacklevel=2)
         return Trained(*run.learnt(), None, [], 0, 0.0)
     return run.go(how.seconds, how.chunks, how.target_error, folder, progress)
 
@@ -318,7 +315,7 @@ class _ObjectTraining:
         self.start = start
         self.object, self.recipe, self.seed, self.work, self.camera = obj, recipe, seed, work, camera
         self.identity, self.frame = identify(obj), frame_of(obj)
-        self.base = storing.base_model(obj, recipe.base_model)
+        self.base = HalfSpace(obj, BASE_MODEL)
         self.proposals = EntryProposals(obj, self.base)
         self.source = PairSource(obj, self.frame, self.base, self.proposals)
         self.seen: CameraExits | None = None
@@ -470,7 +467,6 @@ class _ObjectTraining:
     def _record(self, errors: list[RadianceError], seconds: float) -> dict[str, Any]:
         return {
             "recipe": asdict(self.recipe), "seed": self.seed, "steps": self.fitting.step, "chunks": self.done,
-            storing.CHECKSUMS: storing.base_checksums(self.object, self.recipe.base_model),
             "walks": self.walks * self.done, "seconds": seconds, "history": self.history,
             "errors": [row._asdict() for row in errors], "provenance": provenance(seed=self.seed),
         }  # fmt: skip

@@ -55,7 +55,6 @@ from full_geometry.transport.exit_pairs import EntryProposals, trace_exits, trac
 from full_geometry.transport.features import Lanes, Side
 from full_geometry.transport.half_space import HalfSpaceProposals, area_share
 from full_geometry.transport.one_object import HalfSpace
-from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.lazy import once
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.neural.store import checksum_of, load_weights
@@ -200,24 +199,14 @@ class NeuralShape(Transport):
     def _scale(self) -> mi.Spectrum:
         return mi.Spectrum([opaque(s) for s in self.scales or [1.0] * len(self.media)])
 
-    @property
-    def models(self) -> list[BSSRDF]:
-        """The half-space model of each channel."""
-        return self.half_space.models
-
-    def end(self, at: SurfacePoint, active: mi.Bool = True) -> End:
-        return end(self.object, at, active)
-
     def prepare(self, at: SurfacePoint, active: mi.Bool = True) -> End:
         """The exit's side, for as many entries as are asked for."""
-        return self.end(at, active)
+        return end(self.object, at, active)
 
     def S(self, exit: End, at: SurfacePoint, active: mi.Bool = True) -> mi.Spectrum:
         """S(x_i, w_i; x_o, w_o) per channel, 1/((scene unit)² sr); 0 below the horizons.
         `exit`: from `prepare`. `at`: entry, with w_i."""
-        return self(exit, self.end(at, active), active)
-
-    def __call__(self, exit: End, entry: End, active: mi.Bool = True) -> mi.Spectrum:
+        entry = end(self.object, at, active)
         S_0 = self.half_space(exit, entry)
         pairs = describe(self.object, exit, entry, self.half_space.shares(S_0, exit, entry), active)
         f = mi.Spectrum([self._f(pair, numbers) for pair, numbers in zip(pairs, self._media)])

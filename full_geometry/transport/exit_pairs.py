@@ -27,7 +27,6 @@ from full_geometry.geometry.points import (
 )
 from full_geometry.objects.objects import TranslucentObject
 from full_geometry.transport.features import (
-    BaseModel,
     ObjectFrame,
     PreparedExit,
     Side,
@@ -36,6 +35,7 @@ from full_geometry.transport.features import (
     pair_features,
     side_features,
 )
+from full_geometry.transport.one_object import HalfSpace
 from full_geometry.transport.patches import AREA_SHARE, LearntProposals, PatchSampler, WeightTable
 from full_geometry.walk.media import media_within
 from full_geometry.walk.random_walk import WalkExits, exits
@@ -137,7 +137,7 @@ class EntryProposals:
     def __init__(
         self,
         obj: TranslucentObject,
-        base: BaseModel,
+        base: HalfSpace,
         area_share: float = AREA_SHARE,
         patches: PatchSampler | None = None,
     ) -> None:
@@ -171,12 +171,12 @@ class EntryProposals:
 @dataclass(frozen=True, eq=False)
 class PairSource:
     """Makes training data.
-    `base`: base model S_0, which values of proposals have. `proposals`: where they come from. `scale`: of T of each
+    `base`: S_0, which values of proposals have. `proposals`: where they come from. `scale`: of T of each
     channel, one over its mean; without it every walk that left is kept."""
 
     object: TranslucentObject
     frame: ObjectFrame
-    base: BaseModel
+    base: HalfSpace
     proposals: EntryProposals
     scale: mi.Spectrum | None = None
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -32,7 +32,6 @@ from full_geometry.surface.varying import grid_values
 from full_geometry.walk.media import walk_media
 from halfspace_sss.arrays import library
 from halfspace_sss.backend import one_blas_thread
-from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.physics import fresnel
 from halfspace_sss.tracing.walk import generator, pass_seed
@@ -460,20 +459,6 @@ def reverse(n: int, channels: int) -> tuple[np.ndarray, np.ndarray]:
     signs = np.ones(2 * n + n_pair(channels), dtype=np.float32)
     signs[2 * n + np.array([0, 1, 2, 9, 10, 11, 12])] = -1
     return np.concatenate([np.arange(n, 2 * n), np.arange(n), 2 * n + pair]), signs
-
-
-class BaseModel(Protocol):
-    """What the network of one object begins with and multiplies: `HalfSpace`, or the network of all shapes.
-    `models`: half-space model of each channel, whose radial densities probes follow."""
-
-    @property
-    def models(self) -> Sequence[BSSRDF]: ...
-
-    def end(self, at: SurfacePoint, active: mi.Bool = True) -> Side:
-        """What belongs to one end alone, its point and its first event among it."""
-
-    def __call__(self, exit: Side, entry: Side, active: mi.Bool = True) -> mi.Spectrum:
-        """S of two ends per channel, 1/((scene unit)² sr); 0 below the horizons."""
 
 
 class PreparedExit(NamedTuple):

@@ -1,6 +1,6 @@
-"""S of one object: a base model times what a small network has learnt, and its directional albedo, in Dr.Jit.
+"""S of one object: a half-space model times what a small network has learnt, and its directional albedo, in Dr.Jit.
 
-The base model S_0 is a half-space model with a floor, so that no exit is out of its reach.
+The half-space model S_0 has a floor, so that no exit is out of its reach.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ import numpy as np
 from full_geometry.geometry.points import SurfacePoint, Transport, opaque, plane_query
 from full_geometry.objects.objects import TranslucentObject
 from full_geometry.transport.features import (
-    BaseModel,
     ObjectFrame,
     PreparedExit,
     Quadratic,
@@ -38,6 +37,7 @@ from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.physics import fresnel
 from halfspace_sss.registry import bssrdf
 
+BASE_MODEL = "better_dipole"  # of S_0
 FLOOR = 1e-2  # reflectance of the floor, over that of the half-space
 
 
@@ -164,12 +164,12 @@ class FullGeometry(Transport):
         base: S_0.
         weights: W_k (outputs, inputs) and b_k of the layers, Q of h.
         alpha: ∫ S mu_i of an exit, learnt beside S.
-        checksums: of the file of weights, and of those of its base model.
+        checksums: of the file of weights.
     """
 
     object: TranslucentObject
     frame: ObjectFrame
-    base: BaseModel
+    base: HalfSpace
     weights: Mapping[str, np.ndarray]
     alpha: DirectionalAlbedo
     checksums: tuple[str, ...] = ()

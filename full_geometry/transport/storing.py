@@ -20,20 +20,18 @@ from full_geometry.geometry import mesh
 from full_geometry.geometry.points import ObjectModel, PositionSampler, RadialTable, opaque
 from full_geometry.geometry.shape import name_of
 from full_geometry.geometry.snapshot import object_digest
-from full_geometry.objects.objects import TranslucentObject, check_geometry, refuse_textures
+from full_geometry.objects.objects import TranslucentObject, check_geometry
 from full_geometry.settings import AUTOMATIC, Settings
 from full_geometry.surface.translucent import MediumSpec
 from full_geometry.surface.varying import grid_values
 from full_geometry.surface.wrapped import surface_of
-from full_geometry.transport import any_shape as shapes
-from full_geometry.transport.features import REFLECTIONS, BaseModel, ObjectFrame, n_local, n_pair, n_side, surroundings
+from full_geometry.transport.features import REFLECTIONS, ObjectFrame, n_local, n_pair, n_side, surroundings
 from full_geometry.transport.half_space import HalfSpaceProposals
-from full_geometry.transport.one_object import DirectionalAlbedo, FullGeometry, HalfSpace
+from full_geometry.transport.one_object import BASE_MODEL, DirectionalAlbedo, FullGeometry, HalfSpace
 from full_geometry.transport.patches import AREA_SHARE, LearntProposals, Patches, PatchSampler, PatchTable
 from halfspace_sss.neural.store import checksum_of, load_weights, save_weights, weights_folder
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import path_of
-from halfspace_sss.registry import bssrdf
 
 ANCHORS = 256
 CLOSE = 1e-4  # positions over the size of the object, coefficients relative
@@ -281,7 +279,7 @@ def frame_of(obj: TranslucentObject, trained: Identity | None = None, turns: np.
 
 
 KIND = "full_geometry"
-CHECKSUMS = "start_checksums"  # of a record
+BOUND_TO = {"base_model": BASE_MODEL, "reflections": REFLECTIONS}  # what weights multiply, in their record
 CENTRES, TRUSTED, TURNS, ENDS = "centres", "even", "turns", "Q"
 S_LAYERS, ALPHA_LAYERS, PATCH_LAYERS = ("W_", "b_", ENDS), ("A_", "a_"), ("V_", "c_")
 
@@ -310,7 +308,7 @@ def save(
     folder: str | os.PathLike[str], identity: Identity, arrays: dict[str, np.ndarray], record: dict[str, Any]
 ) -> Path:
     """Write the weights of an object and their record; returns the path."""
-    whole = {"orders": "multiple", "reflections": REFLECTIONS, **identity.record(), **record}
+    whole = {"orders": "multiple", **BOUND_TO, **identity.record(), **record}
     bound = {"anchors": identity.anchors.astype(np.float32)}
     if identity.grids:
         bound["probes"] = identity.probes
@@ -325,9 +323,7 @@ def find_weights(obj: TranslucentObject, folder: str | os.PathLike[str] | None =
     reasons = []
     for path in sorted(place.glob(f"{KIND}-{here.digest()}-*.safetensors")):
         try:
-            identity, _, record = _trained(path)
-            identity.pose(here)
-            _checked_base(path, record, _as_trained(obj, identity.medium))
+            _trained(path)[0].pose(here)
             return path
         except ValueError as error:
             reasons.append(f"{path.name}: {error}")
@@ -353,8 +349,8 @@ def nearest(
     obj: TranslucentObject, recipe: Mapping[str, Any], folder: str | os.PathLike[str] | None = None
 ) -> Neighbour | None:
     """Weights of the same shape with the medium that is most alike, from which a training may start; None without any.
-    `obj`: the object; weights are of homogeneous media with nothing inside. `recipe`: of its training; sizes and base
-    model must be those of the weights."""
+    `obj`: the object; weights are of homogeneous media with nothing inside. `recipe`: of its training; sizes must
+    be those of the weights."""
     here, found = identify(obj), []
     if here.grids or here.contents or here.textures:
         return None
@@ -362,12 +358,11 @@ def nearest(
         try:
             identity, arrays, record = _trained(path)
             R, _ = identity.moved(here)
-            _checked_base(path, record, obj)
         except ValueError:
             continue
         same = identity.kind == here.kind and identity.topology == here.topology
         same = same and not (identity.contents or identity.textures)
-        alike = all(record["recipe"].get(key) == recipe[key] for key in ("width", "depth", "base_model"))
+        alike = all(record["recipe"].get(key) == recipe[key] for key in ("width", "depth"))
         apart = _apart(identity.medium, here.medium)
         if same and np.allclose(R, np.eye(3), atol=1e-3) and alike and apart <= MOST_APART:
             found.append(Neighbour(path, arrays, apart))
@@ -394,9 +389,10 @@ def trained(obj: TranslucentObject) -> bool:
 
 def _trained(path: Path) -> tuple[Identity, dict[str, np.ndarray], dict[str, Any]]:
     arrays, record = load_weights(path, KIND)
-    if record.get("reflections") != REFLECTIONS:
-        known = f"reflections must be {REFLECTIONS}, got {record.get('reflections')}"
-        raise ValueError(f"{path.with_suffix('.json')}: {known}: of another version, to be trained again")
+    for key, wanted in BOUND_TO.items():
+        if record.get(key) != wanted:
+            known = f"{key} must be {wanted}, got {record.get(key)}"
+            raise ValueError(f"{path.with_suffix('.json')}: {known}: of another version, to be trained again")
     if missing := sorted({TRUSTED, TURNS, ENDS} - arrays.keys()):
         raise ValueError(f"{path}: arrays must hold {', '.join(missing)}, got none: to be trained again")
     try:
@@ -410,20 +406,6 @@ def _trained(path: Path) -> tuple[Identity, dict[str, np.ndarray], dict[str, Any
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path.with_suffix('.json')}: record must describe an object, {error} is wrong") from error
     return identity, arrays, record
-
-
-def _checked_base(path: Path, record: dict[str, Any], obj: TranslucentObject) -> str:
-    """Name of the model that weights multiply; ValueError if they were fitted to others of it than are here now."""
-    place = path.with_suffix(".json")
-    try:
-        name, fitted = record["recipe"]["base_model"], tuple(record[CHECKSUMS])
-    except (KeyError, TypeError) as error:
-        raise ValueError(f"{place}: base_model must be recorded: of another version, to be trained again") from error
-    if fitted != base_checksums(obj, name):
-        raise ValueError(
-            f"{place}: weights of the base model {name} must be those of training, got others: to be trained again"
-        )
-    return name
 
 
 def load(path: str | os.PathLike[str], obj: TranslucentObject) -> Learnt:
@@ -443,33 +425,17 @@ def load(path: str | os.PathLike[str], obj: TranslucentObject) -> Learnt:
         n = 2 * (n_side(channels, n_local(obj)) + units) + n_pair(channels)
         if n != known:
             raise ValueError(f"W_0 must have {n} inputs, got {known}: of another version, to be trained again")
-        base = base_model(obj, _checked_base(path, record, obj))
     except KeyError as error:
         raise ValueError(f"{path}: layers must be those of {KIND}, {error} is missing") from error
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    return assemble(obj, frame, base, arrays)
-
-
-def base_model(obj: TranslucentObject, name: str) -> BaseModel:
-    """What the network of an object begins with: the network of all shapes, or a half-space model.
-    ValueError if there is no such model, or it does not take the medium."""
-    if name == shapes.KIND and obj.textured is not None:
-        refuse_textures(obj.geometry.name, f"the base model {name!r}")
-    return shapes.transport(obj) if name == shapes.KIND else HalfSpace(obj, name)
-
-
-def base_checksums(obj: TranslucentObject, name: str) -> tuple[str, ...]:
-    """Checksums of the weights that a base model has."""
-    if name == shapes.KIND:
-        return shapes.checksums(obj)
-    return tuple(checksum for m in obj.media for checksum in bssrdf(name, m).checksums)
+    return assemble(obj, frame, HalfSpace(obj, BASE_MODEL), arrays)
 
 
 def assemble(
     obj: TranslucentObject,
     frame: ObjectFrame,
-    base: BaseModel,
+    base: HalfSpace,
     arrays: Mapping[str, np.ndarray],
     patches: Patches | None = None,
 ) -> Learnt:
@@ -504,7 +470,7 @@ def learnt_model(obj: TranslucentObject, settings: Settings) -> ObjectModel:
     path = find_weights(obj)
     model, sampler = load(path, obj)
     backbone = model.base.models
-    transport = replace(model, checksums=(checksum_of(path, KIND), *load_weights(path, KIND)[1][CHECKSUMS]))
+    transport = replace(model, checksums=(checksum_of(path, KIND),))
     table = RadialTable([m for m in backbone if float(m.medium.sigma_s) > 0], geometry.size)
     by_itself = AREA_SHARE if sampler is None else 0.0  # patches reach everywhere
     share = by_itself if settings.area_share == AUTOMATIC else settings.area_share

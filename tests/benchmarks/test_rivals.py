@@ -17,9 +17,8 @@ dr = pytest.importorskip("drjit")
 torch = pytest.importorskip("torch")
 pytest.importorskip("zuko")
 
-from waxen import BUNNY, WAX, random_layers, random_patches, wax_bunny  # noqa: E402
+from waxen import BUNNY, random_layers, random_patches, wax_bunny  # noqa: E402
 
-from benchmarks import rivals  # noqa: E402
 from benchmarks.__main__ import app  # noqa: E402
 from benchmarks.alpha_p import AlphaP, fit_alpha_p  # noqa: E402
 from benchmarks.flow import N_CONTEXT, Chart, ConditionalFlow, FlowSampler  # noqa: E402
@@ -28,9 +27,8 @@ from benchmarks.lightings import LIGHTINGS, lighting  # noqa: E402
 from benchmarks.rivals_command import _errors_wide  # noqa: E402
 from benchmarks.tables import markdown  # noqa: E402
 from full_geometry.geometry.points import EntrySample  # noqa: E402
-from full_geometry.learning.model_errors import LIGHTS, reference  # noqa: E402
-from full_geometry.learning.network_fitting import Recipe  # noqa: E402
-from full_geometry.objects.objects import TranslucentObject, object_of  # noqa: E402
+from full_geometry.learning.model_errors import reference  # noqa: E402
+from full_geometry.objects.objects import TranslucentObject  # noqa: E402
 from full_geometry.transport.features import n_side  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
@@ -106,7 +104,7 @@ def test_no_light_comes_from_below_the_surface(obj: TranslucentObject, kind: str
 @pytest.mark.parametrize(
     "bad, message",
     [
-        (["--table", "images"], "table must be one of errors, samplers, base_models"),
+        (["--table", "images"], "table must be one of errors, samplers"),
         (["--seconds", "0"], "seconds must"),
         (["--samples", "1"], "samples must"),
     ],
@@ -119,18 +117,5 @@ def test_tables_refuse_bad_input_before_anything_is_traced(scene_file: Path, bad
 def test_a_table_of_errors_has_a_row_for_each_model() -> None:
     rows = [{"model": m, "channel": c, "light": "constant", "error": 0.1, "standard_error": 0.01, "ratio": 1.0}
             for m in ("a", "b") for c in (0, 1)]  # fmt: skip
-    text = markdown(_errors_wide(pandas.DataFrame(rows), ["model"]))
+    text = markdown(_errors_wide(pandas.DataFrame(rows)))
     assert text.splitlines()[2:] == ["| a | 10 ± 1 | 10 ± 1 |", "| b | 10 ± 1 | 10 ± 1 |"]
-
-
-def test_the_table_of_base_models_has_all_of_both(mono: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    ball = object_of(mi.load_dict({"type": "sphere", "radius": 3.0}), WAX.channel(1))
-    monkeypatch.setattr(rivals, "STANDARD", Recipe(width=24, depth=2, batch=1024, chunk=2**13, reuse=2))
-    monkeypatch.setattr(rivals, "TIMES", ((0.0, 1.0), (1.0, 0.5)))
-    monkeypatch.setattr(rivals, "object_of", lambda *_: ball)
-    table = rivals.base_model_table(None, seconds=0.5, exits=64, walks=1024, samples=1024)
-    assert list(table.groupby(["base_model", "planned"], sort=False).size()) == [2, 2, 2, 2]
-    assert np.all((table["steps"] > 0) == (table["planned"] > 0))
-    assert np.all(table["seconds"][table["planned"] > 0] > 0)
-    untrained = table[(table["planned"] == 0) & (table["light"] == LIGHTS[0])].set_index("base_model")
-    assert untrained["error"]["neural_shape"] < 0.5 * untrained["error"]["better_dipole"]

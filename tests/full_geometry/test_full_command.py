@@ -85,16 +85,6 @@ def test_an_object_is_trained_measured_and_rendered(monkeypatch: Any) -> None:
     assert result.exit_code == 0 and Path("render/ball_full_geometry.exr").exists(), result.output
 
 
-@pytest.mark.slow
-def test_an_object_begins_with_the_network_of_all_shapes_and_is_rendered() -> None:
-    result = _invoke("train", "object", "--scene", "ball.xml", "--base-model", "neural_shape")
-    assert result.exit_code == 0, result.output
-    (_, path) = _weights()
-    assert load_weights(path, "full_geometry")[1]["recipe"]["base_model"] == "neural_shape"
-    result = _invoke("render", "ball.xml", "--model", "full_geometry", "--spp", "4", "--train-seconds", "0")
-    assert result.exit_code == 0 and Path("render/ball_full_geometry.exr").exists(), result.output
-
-
 ASIDE = BALL.replace("NAME", "other").replace('value="1"/>', 'value="2"/><point name="center" x="5" y="0" z="0"/>')
 TWO = XML.replace("  <sensor", f"{ASIDE}  <sensor")
 
@@ -227,7 +217,6 @@ REFUSED = [
     ),
     ([*TRAIN_BALL, "--out", "ball.xml"], "folder must be a folder or new, got 'ball.xml'"),
     ([*TRAIN_BALL, "--define", "x"], "define must be NAME=VALUE, got 'x'"),
-    ([*TRAIN_BALL, "--base-model", "neural_shap"], "base_model must be one of neural_shape,"),
     ([*ERRORS, "--model", "no_model"], "model must be one of"),
     ([*ERRORS, "--model", "neural_shap"], "did you mean 'neural_shape'?"),
     (

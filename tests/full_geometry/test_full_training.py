@@ -252,6 +252,15 @@ def test_weights_of_other_inputs_are_refused(trained: Trained, tmp_path: Path) -
         storing.load(path, trained.model.object)
 
 
+@pytest.mark.parametrize("changed", [{"base_model": "neural"}, {"reflections": 1}])
+def test_weights_that_multiply_something_else_are_refused(trained: Trained, changed: dict, tmp_path: Path) -> None:
+    arrays, record = load_weights(trained.path, storing.KIND)
+    path = save_weights(tmp_path / trained.path.name, storing.KIND, arrays, {**record, **changed})
+    ((key, value),) = changed.items()
+    with pytest.raises(ValueError, match=f"{key} must be .*, got {value}: of another version, to be trained again"):
+        storing.load(path, trained.model.object)
+
+
 @pytest.mark.slow
 def test_a_moved_and_turned_mesh_is_the_same_object(tmp_path: Path) -> None:
     model = train(mi.load_dict(bunny()), WAX, chunks=2, recipe=QUICK, folder=tmp_path).model
