@@ -14,8 +14,8 @@ traced by the walks of the image, which end at their second event (`walk_paths`)
 No model knows what lies inside an object, what overlaps it, or where its instances stand: L_g is then 0 and a that of
 the reflectance of the medium, so that C is all deep light.
 
-Not corrected: detail that is finer than the distance of points, and C beyond its second degree in w_o, or the third of
-its cosine.
+Not corrected: detail that is finer than the distance of points, as webs between fingers that are half a mean free path
+thin, and C beyond its second degree in w_o, or the third of its cosine.
 """
 
 from __future__ import annotations
@@ -56,6 +56,7 @@ SAMPLES_PER_WALK = 8  # of the image
 MOST_PLACES = 64  # of objects and their instances
 ROOTS = (*R_4, GOLDEN)  # not the fifth power of the same root: directions would lie on a line, as 1/g⁴ + 1/g⁵ = 1
 LEAST_ALBEDO = 1e-6
+SAMPLES_OF_LIGHT, FEWEST_OF_LIGHT = 4, 2**20  # of the image that light inside is precomputed for: of a walk, of all
 BRIGHTEST = 1 / 16384  # of the residuals of a launch, which are as bright as the next
 SEED = 500
 
@@ -91,12 +92,12 @@ class SurfaceCorrection:
     ) -> SurfaceCorrection:
         """The regression of residuals."""
         points = gathered.points
-        p, n, n_out = (np.array(v, dtype=float).T for v in (points.p, points.n, points.n_out))
+        p, n = (np.array(v, dtype=float).T for v in (points.p, points.n))
         B = np.array(gathered.values, dtype=float).reshape(len(points), -1, gathered.terms)
         G = B[:, :, 0].mean(axis=1)
         G = (G - G.mean()) / max(float(G.std()), 1e-12 + 1e-3 * float(np.abs(G).mean()))
         found = levels(p, n, area, float(sum(half.number.sum() for half in halves)))
-        C, squared = smooth_field(found, (p, n_out), G, halves)
+        C, squared = smooth_field(found, p, G, halves)
         # RMS over points, over the mean of all light that leaves
         whole = np.square((halves[0] + halves[1]).mean).sum()
         return cls(gathered, area, halves, launches, C, float(np.sqrt(squared.mean() / whole)) if whole > 0 else 0.0)
@@ -200,7 +201,7 @@ class Corrections:
         missing = [k for k, g in enumerate(gathered) if g and (self._launches(k) < launches)]
         if missing or walk.outgoing is None:
             walk.outgoing = None
-            tracer = walk.tracer(scene, SEED, 4 * number)
+            tracer = walk.tracer(scene, SEED, max(SAMPLES_OF_LIGHT * number, FEWEST_OF_LIGHT))
             tracer = replace(tracer, visitor=replace(tracer.visitor, deep=True))
             for k in missing:
                 known = self._known[k]

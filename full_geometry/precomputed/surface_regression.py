@@ -1,16 +1,16 @@
 """A smooth field over a surface from noisy residuals, by local regressions of several widths.
 
 Residuals r_s at places of points j in directions w_s are fitted by r = a(w) C_j . Y(w), Y the
-polynomials of w up to the second degree and one of its cosine (`directional`). About each of K centres the
+polynomials of w up to the second degree, and of its cosine up to the third (`directional`). About each of K centres the
 weighted least squares
 
     min Σ_j W_cj Σ_s a_s (r_s / a_s - beta . phi_js)²,    phi = ((x_j - x_c) / h, G_j - G_c, Y(w_s)),
 
 G a feature of points that C may follow, as light that was gathered there, W_cj = (1 - d² / h²)² max(n_c.n_j, 0)². The
 weight a keeps the sum of the residuals about each centre. The fits of all centres in reach are blended by the same
-weights W_cj. Before the levels, all residuals are fitted by (1, G) times cubic polynomials of the cosine: there models
-err alike everywhere. Level 0 is one fit of all points, each further level has four times as many centres as the one
-before and fits what the coarser ones leave. C is the first fit Z and what each level adds,
+weights W_cj. Before the levels, all residuals are fitted by (1, G) times the polynomials of the cosine: there
+models err alike everywhere. Level 0 is one fit of all points, each further level has four times as many centres as the
+one before and fits what the coarser ones leave. C is the first fit Z and what each level adds,
 
     C = Z + Σ_l kappa_l d^(l),    kappa_l = S[d_1 d_2] / S[(d_1 + d_2)² / 4],
 
@@ -37,16 +37,17 @@ FIRST_CENTRES, FACTOR = 16, 4
 REACH = 2.0  # h over the mean distance of centres
 RIDGE = 0.001  # of the sum of weights, on all but the constant; features are of the order of one
 NOISE = 20.0  # more of it for each residual: their variance over that of coefficients
-TERMS, LOCAL = 10, 9  # of `directional`, and those that levels fit
+TERMS, ZONAL = 12, 3  # of `directional`, and the last of them, which are of the cosine alone
 LEAST_OF_LEVEL = 24  # residuals for each centre of a level, on average
 FINER = 2.0  # power of detail that no level has, over that of the finest level
 
 
 def directional(x: Any, y: Any, z: Any, mu: Any) -> list[Any]:
-    """Y of a direction of cosine mu: 1, x, y, z, x² - z², y² - z², xy, xz, yz, ((mu - .85) / .15)³, of any arrays.
+    """Y of a direction of cosine mu: 1, x, y, z, x² - z², y² - z², xy, xz, yz, t, t², t³, of any arrays.
+    t = (mu - .85) / .15 is of the normal at each place, as on fingers normals turn by more than places can follow.
     Directions inside that refraction reaches have a mu of .7 to 1, for an index of 1.4."""
     t = (mu - 0.85) * (1 / 0.15)
-    return [x * 0 + 1, x, y, z, x * x - z * z, y * y - z * z, x * y, x * z, y * z, t * t * t]
+    return [x * 0 + 1, x, y, z, x * x - z * z, y * y - z * z, x * y, x * z, y * z, t, t * t, t * t * t]
 
 
 @dataclass(frozen=True)
@@ -125,9 +126,8 @@ class Level:
         `features`: (points, 1 + U), 1 and x / size and G of each point. `sums`: of the residuals."""
         # ---- moments about each centre, of phi = (1, u, Y): Σ_j W_cj Σ_s a phi phi^T and Σ_j W_cj Σ_s a phi r / a
         N, U = features.shape
-        more, of = LOCAL - 1, slice(1, LOCAL)
-        D, W = U + more, self.weights
-        ones, w = sums.a[:, 0, 0], sums.a[:, 0, of]
+        more, D, W = TERMS - 1, U + TERMS - 1, self.weights
+        ones, w = sums.a[:, 0, 0], sums.a[:, 0, 1:]
         uu = ones[:, None, None] * features[:, :, None] * features[:, None, :]
         uw = features[:, :, None] * w[:, None, :]
         ur = features[:, :, None] * sums.r[:, None, 0]
@@ -136,9 +136,9 @@ class Level:
         M[:, :U, :U] = (W @ uu.reshape(N, -1)).reshape(K, U, U)
         M[:, :U, U:] = (W @ uw.reshape(N, -1)).reshape(K, U, more)
         M[:, U:, :U] = np.swapaxes(M[:, :U, U:], 1, 2)
-        M[:, U:, U:] = (W @ sums.a[:, of, of].reshape(N, -1)).reshape(K, more, more)
+        M[:, U:, U:] = (W @ sums.a[:, 1:, 1:].reshape(N, -1)).reshape(K, more, more)
         v[:, :U] = (W @ ur.reshape(N, -1)).reshape(K, U, -1)
-        v[:, U:] = (W @ sums.r[:, of].reshape(N, -1)).reshape(K, more, -1)
+        v[:, U:] = (W @ sums.r[:, 1:].reshape(N, -1)).reshape(K, more, -1)
 
         # ---- features less those of the centre, places over h: phi_c = T phi
         T = np.tile(np.eye(D), (K, 1, 1))
@@ -158,7 +158,7 @@ class Level:
         total = np.asarray(known.sum(axis=1)).ravel()
         beta = (known @ beta.reshape(K, -1)).reshape(N, D, -1) / np.maximum(total, 1e-30)[:, None, None]
         constant = (features[:, :, None] * beta[:, :U]).sum(axis=1, keepdims=True)
-        return np.concatenate([constant, beta[:, U:], np.zeros_like(beta[:, : TERMS - LOCAL])], axis=1)
+        return np.concatenate([constant, beta[:, U:]], axis=1)
 
     def averaged(self, x: np.ndarray) -> np.ndarray:
         """The mean of a value of points (points,) over the neighbourhood: to the centres and back."""
@@ -200,35 +200,29 @@ class _Directions:
         return result
 
 
-def _zonal(n: np.ndarray, G: np.ndarray, sums: ResidualSums) -> np.ndarray:
-    """The field (1, G) (1, mu, mu², mu³) of mu = n.w that fits all residuals best, (points, terms, channels)."""
-    # mu² = Σ n_i n_j w_i w_j in terms of Y, with |w| = 1
-    x, y, z = n.T
-    Z = np.zeros((4, len(n), TERMS))
-    Z[0, :, 0], Z[1, :, 1:4], Z[3, :, LOCAL] = 1, n, 1
-    Z[2, :, 0], Z[2, :, 4:LOCAL] = (
-        1 / 3,
-        np.column_stack([x * x - 1 / 3, y * y - 1 / 3, 2 * x * y, 2 * x * z, 2 * y * z]),
-    )
-    F = np.concatenate([Z, G[:, None] * Z])
-
-    # (Σ F^T a F) beta = Σ F^T r
-    aF = np.stack([(sums.a * f[:, None, :]).sum(axis=2) for f in F])
-    M, v = np.tensordot(F, aF, ((1, 2), (1, 2))), np.tensordot(F, sums.r, 2)
-    beta = np.linalg.solve(M + 1e-9 * max(float(M[0, 0]), 1e-30) * np.eye(len(F)), v)
-    return np.tensordot(F, beta, (0, 0))
+def _zonal(G: np.ndarray, sums: ResidualSums) -> np.ndarray:
+    """The field (1, G) (1, t, t², t³) that fits all residuals best, (points, terms, channels)."""
+    # (Σ F^T a F) beta = Σ F^T r, of F = (1, G) times some of the terms
+    of, F = [0, *range(TERMS - ZONAL, TERMS)], np.column_stack([np.ones(len(G)), G])
+    size = len(of) * F.shape[1]
+    M = np.einsum("ju,jv,jab->uavb", F, F, sums.a[:, of][:, :, of]).reshape(size, size)
+    v = np.einsum("ju,jac->uac", F, sums.r[:, of]).reshape(size, -1)
+    beta = np.linalg.solve(M + 1e-9 * max(float(M[0, 0]), 1e-30) * np.eye(size), v)
+    C = np.zeros_like(sums.r)
+    C[:, of] = np.einsum("ju,uac->jac", F, beta.reshape(F.shape[1], len(of), -1))
+    return C
 
 
 def smooth_field(
-    of: list[Level], at: tuple[np.ndarray, np.ndarray], G: np.ndarray, halves: tuple[ResidualSums, ResidualSums]
+    of: list[Level], p: np.ndarray, G: np.ndarray, halves: tuple[ResidualSums, ResidualSums]
 ) -> tuple[np.ndarray, np.ndarray]:
     """C (points, channels, terms), and its mean squared error (points,), the sum over channels.
-    `of`: levels. `at`: positions and normals (points, 3). `G`: a feature (points,), of the order of one. `halves`:
-    independent residuals."""
+    `of`: levels. `p`: positions (points, 3). `G`: a feature (points,), of the order of one. `halves`: independent
+    residuals."""
     # ---- one fit of all points by the cosine, then what each level adds, filtered
-    (p, n), directions = at, _Directions(halves[0].a + halves[1].a)
+    directions = _Directions(halves[0].a + halves[1].a)
     features = np.column_stack([np.ones(len(p)), (p - p.mean(axis=0)) / size_of(p), G])
-    C, lost = [_zonal(n, G, half) for half in halves], np.zeros(len(p))
+    C, lost = [_zonal(G, half) for half in halves], np.zeros(len(p))
     for k, level in enumerate(of):
         left = [replace(half, r=half.r - half.a @ C_half) for half, C_half in zip(halves, C)]
         d = [level.fitted(features, half) for half in left]

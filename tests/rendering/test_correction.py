@@ -22,11 +22,19 @@ WHITE = {"sigma_s": "1,1.5,2", "sigma_a": 0.0, "eta": 1.4}
 
 # ---- The regression --------------------------------------------------------------------------------------------------
 
+RADIUS = 0.03  # of a rod of length 1
+
 
 def _sphere(count: int) -> np.ndarray:
     k = np.arange(count)
     z, phi = 1 - 2 * (k * 0.6180339887 % 1), 2 * np.pi * (k * 0.7548776662 % 1)
     return np.column_stack([np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z])
+
+
+def _rod(z: np.ndarray, phi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points of a rod about the z axis, and their normals."""
+    n = np.column_stack([np.cos(phi), np.sin(phi), np.zeros_like(phi)])
+    return np.column_stack([RADIUS * n[:, :2], z]), n
 
 
 def _regression(residuals: int, seed: int = 0) -> tuple[float, float, float]:
@@ -45,7 +53,7 @@ def _regression(residuals: int, seed: int = 0) -> tuple[float, float, float]:
         Y = np.stack(directional(*w.T, 0.7 + 0.3 * (w * p[point]).sum(axis=1)), axis=1)
         r = a * (constant[point] + 0.1 * w[:, :1] + 0.2 * Y[:, -1:]) * rng.exponential(size=(residuals // 2, 1))
         halves.append(ResidualSums.of(point, Y, a, r, r, len(p)))
-    C, squared = smooth_field(levels(p, p, 4 * np.pi, residuals), (p, p), G, (halves[0], halves[1]))
+    C, squared = smooth_field(levels(p, p, 4 * np.pi, residuals), p, G, (halves[0], halves[1]))
     a = halves[0].a + halves[1].a
     Y = a[:, 0] / a[:, :1, 0]
     wanted = constant + 0.1 * Y[:, 1:2] + 0.2 * Y[:, -1:]
@@ -63,6 +71,22 @@ def test_the_error_of_a_field_falls_with_the_residuals_and_is_told_within_a_fact
     assert np.abs(along_normals[-1]) < 0.01
     assert found[-1] < 0.03
     assert ((told / found > 0.5) & (told / found < 2)).all()
+
+
+def test_a_slope_over_the_cosine_is_found_on_a_rod_whose_normals_turn_within_the_reach_of_fits() -> None:
+    rng, k = np.random.default_rng(3), np.arange(1024)
+    p, n = _rod(k * 0.7548776662 % 1 - 0.5, 2 * np.pi * (k * 0.6180339887 % 1))
+    slope, halves = np.sin(6 * p[:, 2:]), []
+    for _ in range(2):
+        point, u = rng.integers(0, 1024, 2**16), rng.normal(size=(2**16, 3))
+        w = n[point] + 0.7 * u / np.linalg.norm(u, axis=1)[:, None]
+        w /= np.linalg.norm(w, axis=1)[:, None]
+        Y = np.stack(directional(*w.T, (w * n[point]).sum(axis=1)), axis=1)
+        r = (1 + slope[point] * Y[:, 9:10]) * np.ones(3)
+        halves.append(ResidualSums.of(point, Y, np.ones_like(r), r, r, 1024))
+    C, _ = smooth_field(levels(p, n, 2 * np.pi * RADIUS, 2**17), p, 0 * k, (halves[0], halves[1]))
+    along = np.stack(directional(*n.T, np.ones(1024)), axis=1)
+    assert np.sqrt(np.square((C * along[:, None, :]).sum(axis=2) - 1 - slope).mean()) < 0.1
 
 
 def test_places_and_directions_of_walks_are_even_in_each_pair_of_dimensions() -> None:
