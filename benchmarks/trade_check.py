@@ -1,25 +1,25 @@
-"""One random scene: an assessment as users make it, a recommendation, and long runs that say how right they were."""
+"""One random scene: an assessment as users make it, a recommendation, and a long run that says how right it was."""
 
 from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
-from benchmarks.long_runs import long_run
 from benchmarks.random_scenes import RandomScene, write_scene
 from full_geometry.geometry.sensors import seeded
 from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.trade.advice import advise
-from full_geometry.trade.assessing import assess_for, corrected_chance
-from full_geometry.trade.results import Assessment, TechniqueTrade
+from full_geometry.trade.assessing import assess_for, assess_stage, corrected_chance
+from full_geometry.trade.results import Assessment, TechniqueTrade, samples_for
 from full_geometry.trade.techniques import (
     CORRECTED,
     READY_FIRST,
     WALKED,
     Effort,
     Job,
-    Stage,
     Technique,
     stage,
 )
@@ -27,30 +27,58 @@ from halfspace_sss.provenance import provenance, write_atomically
 
 WAYS = (*(way.name for way in WALKED), "lambert", f"{READY_FIRST}, {CORRECTED}")
 UNLIKELY = 0.1  # chance to keep the tolerance, below which corrected light has no long run
-FORMAT = "halfspace-sss trade check 8"
+NOISIER = 2.0  # times the noise of plain walks in the same time, beyond which they are not denoised in a long run
+PLAIN = 0.25  # of the seconds of a long run, beside its denoised walks
+KNOWN = 0.05  # relative standard error of the squared error of denoised walks, which ends it
+FORMAT = "halfspace-sss trade check 9"
 
 
 def check_scene(scene: RandomScene, folder: Path, seconds: float, truth_seconds: float) -> dict[str, object]:
     """The record of a scene: the assessment, and the mean of long runs; what the folder holds is not run again."""
     file = write_scene(scene, folder)
     on, ways = stage(file), [Technique.of(name) for name in WAYS]
-    quick = _quick(scene, on, ways, file.with_suffix(".json"), seconds)
-    truth = file.with_suffix(".truth.json")
-    likely = [way for way in ways if way.light != CORRECTED or corrected_chance(scene.tolerance) > UNLIKELY]
-    long = long_run(on, likely, scene.tolerance, truth, seeded(scene.seed, scene.number, 1), truth_seconds)
-    return {"scene": scene.record(), "quick": quick, "long": long.record()}
+
+    def short() -> Assessment:
+        effort = Effort(seconds, seed=seeded(scene.seed, scene.number, 0))
+        return assess_for(on, ways, Job(scene.tolerance, scene.images), effort)
+
+    quick = _once(scene, file.with_suffix(".json"), seconds, ways, short)
+    likely = _likely(scene, ways, Assessment.from_record(quick))
+
+    def long() -> Assessment:
+        effort = Effort(PLAIN * truth_seconds, seed=seeded(scene.seed, scene.number, 1))
+        return assess_stage(on, likely, effort, None, scene.tolerance, truth_seconds, KNOWN)
+
+    truth = _once(scene, file.with_suffix(".truth.json"), truth_seconds, likely, long)
+    return {"scene": scene.record(), "quick": quick, "long": truth}
 
 
-def _quick(scene: RandomScene, on: Stage, ways: list[Technique], path: Path, seconds: float) -> dict[str, object]:
-    """The assessment as users make it, on which the recommendation rests."""
+def _likely(scene: RandomScene, ways: list[Technique], quick: Assessment) -> list[Technique]:
+    """Ways that may be the cheapest, which have a long run."""
+    rows = {row.way: row for o in quick.objects for row in o.ways if not row.refusal}
+    plain = [way for way in ways if way.walks and not way.denoised and way.name in rows]
+    noise = {way.name: rows[way.name].variance * rows[way.name].seconds for way in plain}
+
+    def may_win(way: Technique) -> bool:
+        if way.light == CORRECTED:
+            return corrected_chance(scene.tolerance) > UNLIKELY
+        name = replace(way, denoised=False).name
+        return not way.denoised or noise.get(name, math.inf) < NOISIER * min(noise.values(), default=math.inf)
+
+    return [way for way in ways if may_win(way)]
+
+
+def _once(
+    scene: RandomScene, path: Path, seconds: float, ways: list[Technique], measure: Callable[[], Assessment]
+) -> dict[str, object]:
+    """The record of an assessment, measured unless the file has it."""
     how = {"format": FORMAT, "scene": scene.record(), "seconds": seconds, "ways": [way.name for way in ways]}
     if path.is_file():
         record = json.loads(path.read_text(encoding="utf-8"))
         if json.loads(json.dumps(how)).items() <= record.items():
-            return record["quick"]
-    number = seeded(scene.seed, scene.number, 0)
-    result = assess_for(on, ways, Job(scene.tolerance, scene.images), Effort(seconds, seed=number)).record()
-    record = {**how, "quick": result, "provenance": provenance(**how)}
+            return record["found"]
+    result = measure().record()
+    record = {**how, "found": result, "provenance": provenance(**how)}
     write_atomically(path, json.dumps(record, indent=1) + "\n")
     return result
 
@@ -68,14 +96,12 @@ def outcome(record: dict[str, object]) -> dict[str, object]:
     option = chosen.options[0]
     truth = {row.way: row for row in long.objects[0].ways if not row.refusal}
     row, pixels = truth[option.way], long.objects[0].pixels
-    fewer = max(row.least / option.spp, 1.0)  # of denoised walks, whose error is that of `least` samples
-    error2 = max(row.bias2, 0.0) * fewer + row.variance / option.spp
-    error2_error = math.hypot(row.bias2_error, row.variance_error / option.spp)
+    error2 = max(row.bias2, 0.0) + row.noise2(option.spp)
+    error2_error = math.hypot(row.bias2_error, row.variance_error / option.spp**row.power)
     least = {name: _least(w, scene, pixels) for name, w in truth.items()}
     cheapest = min(least, key=lambda name: least[name])
-    known = [name for name, w in truth.items() if w.bias2 + 2 * w.bias2_error < scene.tolerance**2]
-    sure = min((least[name] for name in known), default=math.inf)
-    cost = row.training + row.preparation + scene.images * pixels * option.spp * row.seconds
+    sure = min(_cost(w, scene, pixels, samples_for(w, scene.tolerance)) for w in truth.values())
+    cost = _cost(row, scene, pixels, option.spp)
     results |= {"way": option.way, "spp": option.spp, "error": math.sqrt(error2)}
     results |= {"error_standard_error": error2_error / (2 * math.sqrt(error2)), "cost_s": cost}
     results |= {"cheapest": cheapest, "cheapest_s": least[cheapest], "ratio": cost / least[cheapest]}
@@ -85,15 +111,14 @@ def outcome(record: dict[str, object]) -> dict[str, object]:
 
 
 def _least(row: TechniqueTrade, scene: RandomScene, pixels: float) -> float:
-    """Seconds of a job by a way if bias and variance were known, training and preparation included."""
-    left = scene.tolerance**2 - max(row.bias2, 0.0)
-    if not left > 0:
-        return math.inf
-    return (
-        row.training
-        + row.preparation
-        + scene.images * pixels * max(math.ceil(row.variance / left), row.least) * row.seconds
-    )
+    """Seconds of a job by a way whose bias and variance are as measured."""
+    known = replace(row, bias2_error=0.0, variance_error=0.0)
+    return _cost(row, scene, pixels, samples_for(known, scene.tolerance))
+
+
+def _cost(row: TechniqueTrade, scene: RandomScene, pixels: float, spp: float) -> float:
+    """Seconds of a job by so many samples of a pixel, training and preparation included."""
+    return row.job_seconds(scene.images, pixels * math.ceil(spp)) if spp < math.inf else math.inf
 
 
 def z_values(record: dict[str, object]) -> list[tuple[str, float]]:
@@ -103,7 +128,9 @@ def z_values(record: dict[str, object]) -> list[tuple[str, float]]:
     for a in quick.objects[0].ways:
         if a.refusal or a.way == PATH_TRACED:
             continue
-        b = long.objects[0].way(a.way)
+        b = next((row for row in long.objects[0].ways if row.way == a.way and not row.refusal), None)
+        if b is None or Technique.of(a.way).denoised:
+            continue
         error = math.hypot(a.bias2_error, b.bias2_error)
         if error > 0:
             results.append((a.way, (a.bias2 - b.bias2) / error))

@@ -108,7 +108,7 @@ def trade_table(scenes: Scenes) -> pandas.DataFrame:
             }
             row |= {"bias_standard_error": w.bias_error, "bias2": w.bias2, "bias2_standard_error": w.bias2_error}
             row["variance"] = w.variance
-            row |= {"seconds_per_million": 1e6 * w.seconds, "cost": 1e6 * w.seconds * w.variance}
+            row |= {"seconds_per_million": 1e6 * w.seconds, "cost": 1e6 * w.cost}
             rows.append(row | {"flip": w.flip, "flip_noise": w.flip_noise})
     return pandas.DataFrame(rows)
 
@@ -134,7 +134,7 @@ def markdown(scenes: Scenes, seconds: float, settings: Sequence[Mapping[str, obj
         "Variance of a sample times seconds of a million samples, over path tracing's.",
         "",
     ]
-    lines += _grid(scenes, lambda w, o: f"{w.variance * w.seconds / (o.traced.variance * o.traced.seconds):.2g}")
+    lines += _grid(scenes, lambda w, o: f"{w.cost / o.traced.cost:.2g}")
     if settings:
         lines += ["", "## Knobs", "", KNOBS]
         lines += ["| material | knob | setting | way | cost | error, % |", "|---|---|---:|---|---:|---:|"]

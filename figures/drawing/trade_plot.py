@@ -12,11 +12,10 @@ from matplotlib.figure import Figure
 from figures.computing.images import Shot, compared
 from figures.drawing.page import page
 from full_geometry.trade.images import TradePicture
-from full_geometry.trade.results import Assessment, ObjectTrade, TechniqueTrade
+from full_geometry.trade.results import NOISE, Assessment, ObjectTrade, TechniqueTrade
 from full_geometry.trade.techniques import GATHERED
 from halfspace_sss.comparison.style import TEXT, TRACED, Look, look, paper, saved
 
-NOISE = 0.01  # of the mean radiance, to which times are
 LEAST = 0.003  # smallest bias that is drawn; what is below lies there, an arrow down
 MARKERS = {"full_geometry": "P", "neural_shape": "X", "neural": "D", "neural_material": "d", TRACED: "*"}
 
@@ -122,13 +121,11 @@ def _overtime_to_noise(ax: Axes, rows: Sequence[TechniqueTrade], pixels: float, 
     times = np.geomspace(middle / 300, middle * 30, 200)
     for row in rows:
         style = _look(row.way)
-        floor, slope = (0.0 if row is traced else row.bias**2), row.variance * row.seconds * pixels
-        width = 1.6 if row is traced else 1.0
-        ax.plot(times, np.sqrt(floor + slope / times), color=style.color, ls=style.dash, lw=width)
-        crossing = (traced.variance * traced.seconds * pixels - slope) / floor if floor > 0 else 0.0
-        if times[0] < crossing < times[-1]:
-            ax.plot(crossing, math.sqrt(traced.variance * traced.seconds * pixels / crossing), "o", ms=3.2,
-                    mfc="white", mec=style.color, mew=0.9, zorder=4)  # fmt: skip
+        error, width = np.sqrt(row.bias**2 + row.noise2(times / (row.seconds * pixels))), 1.6 if row is traced else 1.0
+        ax.plot(times, error, color=style.color, ls=style.dash, lw=width)
+        overtaken = int(np.argmax(np.sqrt(traced.noise2(times / (traced.seconds * pixels))) < error))
+        if overtaken:
+            ax.plot(times[overtaken], error[overtaken], "o", ms=3.2, mfc="white", mec=style.color, mew=0.9, zorder=4)
     ax.axhline(tolerance, color="0.55", lw=0.6, ls=(0, (4, 3)), zorder=0)
     ax.set(xscale="log", yscale="log", xlabel="time of an image [s]", ylabel="total error")
     ax.set_xlim(times[0], times[-1])

@@ -170,7 +170,7 @@ def object_table(assessed: ObjectTrade) -> Table:
 
 
 def _row(row: TechniqueTrade) -> list[str]:
-    cost = (f"{row.variance:.3g}", f"{1e6 * row.seconds:.3g}", f"{1e6 * row.seconds * row.variance:.3g}")
+    cost = (f"{row.variance:.3g}", f"{1e6 * row.seconds:.3g}", f"{1e6 * row.cost:.3g}")
     means = " ".join(f"{value:.3f}" for value in row.ratio)
     flip = "–" if row.flip is None else f"{row.flip:.3f}"
     return [row.way, row.told_bias, *cost, means, f"{row.preparation:.2g}", f"{row.memory / 1e6:.3g}", flip]

@@ -117,6 +117,10 @@ def _class(variant: str) -> type:
             self._prepared = _prepared(scene, self._prepared, self.mm_per_unit)
             return self._prepared[-1]
 
+        def take_over(self, other: mi.Integrator) -> None:
+            """Take the media and the cells of another integrator of this class that differs in light alone."""
+            self._prepared, self._checked, self._cells = other._prepared, other._checked, other._cells
+
         def take(self, scene: mi.Scene, outgoing: OutgoingLight, light: UnscatteredLight | None) -> None:
             """Light that leaves objects of a scene, by which walks end, and light inside; until something changes."""
             self.outgoing, self._kept = outgoing, (light_state(scene), light and replace(light, scattered=None))

@@ -5,9 +5,9 @@ object each takes, until bias and noise together are at the tolerance e,
 
     T = training + preparation + images n t V / (e² - b²),
 
-and a way with b >= e never gets there. With standard errors s of b² and v of V, and x = 1 / samples, b² + V x is taken
-a standard error above what was measured, b² + V x + sqrt(s² + v² x²). Biases of models are spread over decades, so that
-few lie where that errs: see docs/measurements.md.
+and a way with b >= e never gets there. Noise of denoised walks falls by a power of the samples (`denoised_walks`).
+With standard errors s of b² and v of V, and x = 1 / samples, b² + V x + sqrt(s² + v² x² / 4) is taken: biases of models
+are spread over decades, so that few lie where that errs; noise is as likely below what was measured as above it.
 
 Without a scene, `recommend_flat` finds the cheapest model of a medium for curves over a range of distances. Error:
 energy-weighted relative L1 over pairs of directions against path tracing, see `comparison.model_errors`; cost: seconds
@@ -197,17 +197,17 @@ def _option(assessed: ObjectTrade, row: TechniqueTrade, job: Job) -> _Raw:
     if not needed < math.inf:
         return math.inf, 0.0, row.bias, row
     spp = max(math.ceil(needed), 1)
-    took = row.once + job.images * assessed.pixels * spp * row.seconds
-    return took, spp, math.hypot(row.bias, math.sqrt(row.variance / spp)), row
+    took = row.job_seconds(job.images, assessed.pixels * spp)
+    return took, spp, math.hypot(row.bias, math.sqrt(row.noise2(spp))), row
 
 
 def _in_time(assessed: ObjectTrade, row: TechniqueTrade, job: Job) -> _Raw:
     """Samples and error of a technique in the time that is allowed; its bias where there is no limit."""
     if job.seconds is None:
         return math.inf, 0, row.bias, row
-    left = job.seconds - row.once
+    left = job.seconds - row.job_seconds(job.images, 0.0)
     spp = math.floor(left / (job.images * assessed.pixels * row.seconds)) if left > 0 else 0
-    error = math.hypot(row.bias, math.sqrt(row.variance / spp)) if spp > 0 else math.inf
+    error = math.hypot(row.bias, math.sqrt(row.noise2(spp))) if spp > 0 else math.inf
     return float(job.seconds), spp, error, row
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -20,14 +20,17 @@ from full_geometry.integrators.gathering import PART
 from full_geometry.learning.learners import Learner, learner
 from full_geometry.scenes.reference import check_sensor
 from full_geometry.scenes.scene_files import PATH_TRACED, first_cause
-from full_geometry.trade.images import TILE, TILES, DenoisingBudget, denoised_rows, with_flip
-from full_geometry.trade.measuring import RunBudget, SceneSamples
+from full_geometry.trade.denoised_walks import KNOWN as KNOWN_ERROR
+from full_geometry.trade.denoised_walks import DenoisingBudget, Walked, denoised_rows
+from full_geometry.trade.images import with_flip
+from full_geometry.trade.measuring import RunBudget, SceneSamples, light_variance
 from full_geometry.trade.results import Assessment, ObjectTrade, TechniqueTrade, samples_for
+from full_geometry.trade.sampling import Sampled
+from full_geometry.trade.statistics import joined
 from full_geometry.trade.techniques import (
     CORRECTED,
     GATHERED,
     READY_FIRST,
-    TRACED_SHARE,
     WALKED,
     WALKS,
     Effort,
@@ -43,7 +46,7 @@ from halfspace_sss.progress import NamedProgress
 
 MOST = 384  # points for a tolerance
 WALKED_FIRST = 0.15  # seconds of walks that tell how many points and which techniques are worth a run
-DENOISED_SHARE = 0.25  # of the time, for small images that are denoised
+DENOISED_SHARE = 0.8  # of the time, for small images that are denoised
 FIRST_SHARE = 0.45  # of the time, for the first run of all techniques
 LEAST_SHARE = 0.25  # of the time, for walks and what may win against them, however long all else takes
 LAST_SHARE = 0.1  # likewise, after light has been gathered
@@ -117,14 +120,16 @@ def _chosen(models: Sequence[str] | None) -> list[Technique]:
 
 def assess_stage(
     on: Stage, chosen: Sequence[Technique], effort: Effort, progress: NamedProgress | None = None,
-    tolerance: float | None = None,
+    tolerance: float | None = None, denoising: float | None = None, known: float = KNOWN_ERROR,
 ) -> Assessment:  # fmt: skip
     """As `assess`, of a scene that is made ready, with the time shared by all techniques alike.
-    Denoised walks have the fewest samples that keep a tolerance, or the most that were measured."""
+    Denoised walks have `denoising` seconds each, or end where the error² of the samples that keep the tolerance has the
+    relative error `known`."""
     samples = SceneSamples.of(on, chosen, effort)
-    budget = RunBudget(effort.seconds, effort.samples, effort.traced)
+    budget = RunBudget(effort.seconds, effort.samples)
     samples.run([t for t in chosen if not t.denoised], budget, seeded(effort.seed, 42), progress)
-    _denoise(samples, chosen, effort.seconds, tolerance, True)
+    seconds = DENOISED_SHARE * effort.seconds if denoising is None else denoising
+    _denoise(samples, chosen, seconds, tolerance, True, known)
     return samples.assessment()
 
 
@@ -146,22 +151,14 @@ def assess_for(
 
     # Run walks twice, as the first launch tells little of time.
     run(walks := [t for t in ahead if t.walks], 46)
-    run(walks, 44, RunBudget(len(walks) * WALKED_FIRST, traced=1 / len(walks)))
-    _denoise(samples, chosen, effort.seconds, job.tolerance, every)
+    run(walks, 44, RunBudget(len(walks) * WALKED_FIRST))
+    _denoise(samples, chosen, DENOISED_SHARE * effort.seconds, job.tolerance, every)
     out: dict[Technique, str] = {}
     if every:
-        run(ahead, 42, RunBudget(FIRST_SHARE * effort.seconds, traced=TRACED_SHARE))
+        run(ahead, 42, RunBudget(FIRST_SHARE * effort.seconds))
     else:
-        # Leave out what trains for longer than walks need for the job, with the points that its noise allows.
-        out |= too_dear(samples, first := samples.assessment(), chosen, job)
+        out = _look_at_models(samples, chosen, ahead, later, job, run)
         ahead, later = ([t for t in some if t not in out] for some in (ahead, later))
-        samples.keep(first)
-        # Run one model of the half-space; where it is far off the others are left out, as they err alike.
-        flat = [t for t in ahead if not t.walks and lookup(t.model).capabilities.of_half_space]
-        run(flat[:1], 45)
-        out |= as_far_off(samples.assessment(), flat, later, job.tolerance)
-        ahead, later = ([t for t in some if t not in out] for some in (ahead, later))
-        run([t for t in ahead if not t.walks and t not in flat[:1]], 43)
     first = samples.assessment()
     seen = [k for k, o in enumerate(first.objects) if o.ways and not o.is_dark]
     if not seen:
@@ -175,7 +172,9 @@ def assess_for(
         return promising(of, ahead, later, job, effort.seconds, references)
 
     # Spend the time that is left, less what the most promising gathering takes, on walks and those that may win.
-    few, gathering, _ = look(first)
+    few, gathering, reasons = look(first)
+    if not (every or gathering) and all(t.walks for t in few) and _denoised_wins(first, job):
+        return _with_reasons(first, out | {t: reasons[t] for t in later})
     reserve = sum(making_seconds(first.objects[k], gathering) for k in seen) / len(seen) if gathering else 0.0
     known, alone = 0.0 if every else KNOWN * job.tolerance**2, not every and not gathering and len(few) == 1
     left = max(left_of(first) - reserve, LEAST_SHARE * effort.seconds)
@@ -195,6 +194,24 @@ def assess_for(
         later = [t for t in later if t != gathering]
         few, gathering, reasons = look(again)
     return _with_reasons(again, out | {t: reasons[t] for t in later if t != gathering})
+
+
+def _look_at_models(
+    samples: SceneSamples, chosen: Sequence[Technique], ahead: Sequence[Technique], later: Sequence[Technique],
+    job: Job, run: Callable[[Sequence[Technique], int], None],
+) -> dict[Technique, str]:  # fmt: skip
+    """Run models of those `ahead` after their walks, and say which of them and of those later are left out, and why.
+    `run`: runs some with a number of the seed."""
+    # Leave out what trains for longer than walks need for the job, with the points that its noise allows.
+    out = too_dear(samples, first := samples.assessment(), chosen, job)
+    models = [t for t in ahead if not t.walks and t not in out]
+    samples.keep(first)
+    # Run one model of the half-space; where it is far off the others are left out, as they err alike.
+    flat = [t for t in models if lookup(t.model).capabilities.of_half_space]
+    run(flat[:1], 45)
+    out |= as_far_off(samples.assessment(), flat, later, job.tolerance)
+    run([t for t in models if t not in out and t not in flat[:1]], 43)
+    return out
 
 
 def _with_reasons(assessed: Assessment, out: dict[Technique, str]) -> Assessment:
@@ -228,11 +245,11 @@ def _go_on(
 
 
 def _denoise(
-    samples: SceneSamples, chosen: Sequence[Technique], seconds: float, tolerance: float | None, every: bool
-) -> None:
-    """Measure denoised walks, if not `every` one those with less noise in the same time alone, where that can tell."""
-    asked, share = [t for t in chosen if t.denoised], DENOISED_SHARE * seconds
-    if not asked:
+    samples: SceneSamples, chosen: Sequence[Technique], seconds: float, tolerance: float | None, every: bool,
+    error: float = KNOWN_ERROR,
+) -> None:  # fmt: skip
+    """Measure denoised walks, if not `every` one those with less noise in the same time alone."""
+    if not (asked := [t for t in chosen if t.denoised]):
         return
     found = samples.assessment().objects
     seen = [k for k, o in enumerate(found) if o.ways and not o.is_dark]
@@ -247,26 +264,31 @@ def _denoise(
         if not find_spec("mitsuba_oidn"):
             reason = "no denoiser is installed (mitsuba-oidn)"
         if tolerance is not None and not every and not reason:
-            reason = _not_denoised(plain[technique].name, plain[best].name, costs[technique], share, tolerance)
+            other = plain[best].name
+            reason = "" if technique == best else f"not measured, as {other} has less noise in the same time"
         if reason:
             samples.denoised[technique] = [TechniqueTrade(technique.name, refusal=reason)] * len(found)
             continue
         sensor, seed = samples.effort.sensor, samples.effort.seed
-        known = [(float(np.mean(o.radiance)), rows[k]) if k in rows else None for k, o in enumerate(found)]
-        budget = DenoisingBudget(share, tolerance, sensor, seed)
+        known = [
+            _walked(samples.on, samples.sampled[k][plain[technique]], o, rows[k]) if k in rows else None
+            for k, o in enumerate(found)
+        ]
+        budget = DenoisingBudget(seconds, tolerance, sensor, seed, error)
         samples.denoised[technique] = denoised_rows(samples.on, technique, known, budget)
 
 
-def _not_denoised(name: str, best: str, cost: float, seconds: float, tolerance: float) -> str:
-    """Why denoised walks are not worth a look for a job; empty where they are.
-    In a time T the halves of n pixels that cost t a sample have V 2 n t / T of noise, which leaves their error² that
-    over sqrt(n)."""
-    if name != best:
-        return f"not measured, as {best} has less noise in the same time"
-    error2 = 2 * cost * math.sqrt(TILES * TILE**2) / seconds
-    if error2 > 0.5 * tolerance**2:
-        return f"not measured, as {seconds:.2g} s tell its error to {100 * math.sqrt(error2):.2g} % only"
-    return ""
+def _walked(on: Stage, sampled: list[Sampled], assessed: ObjectTrade, row: TechniqueTrade) -> Walked:
+    parts = [each.estimate for each in sampled]
+    light = light_variance(on, parts)
+    return Walked(float(np.mean(assessed.radiance)), row, sampled[-1].pace, joined(parts).limits, light, on.lit)
+
+
+def _denoised_wins(assessed: Assessment, job: Job) -> bool:
+    """Whether denoised walks are the cheapest on each object that is seen, so that more of plain ones tells nothing."""
+    seen = [(o, [row for row in o.ways if not row.refusal]) for o in assessed.objects if o.ways]
+    best = [min(rows, key=lambda row, o=o: job_seconds(o, row, job)) for o, rows in seen]
+    return all(Technique.of(row.way).denoised for row in best)
 
 
 def _plain(assessed: ObjectTrade, name: str) -> TechniqueTrade:
@@ -433,9 +455,14 @@ def corrected_chance(tolerance: float) -> float:
 
 def cheapest(assessed: ObjectTrade, job: Job) -> float:
     """Seconds of a job by the techniques that have been measured."""
-    rows, n = [row for row in assessed.ways if not row.refusal and row.variance >= 0], job.images * assessed.pixels
-    jobs = [samples_for(row, job.tolerance) * row.seconds * n + row.once for row in rows]
-    return min(jobs, default=math.inf)
+    return min((job_seconds(assessed, row, job) for row in assessed.ways if not row.refusal), default=math.inf)
+
+
+def job_seconds(assessed: ObjectTrade, row: TechniqueTrade, job: Job) -> float:
+    """Seconds of a job by a technique; infinite if it is not known to keep the tolerance."""
+    if not row.variance >= 0:
+        return math.inf
+    return row.job_seconds(job.images, assessed.pixels * samples_for(row, job.tolerance))
 
 
 def contenders(assessed: ObjectTrade, tolerance: float) -> list[str]:
@@ -448,4 +475,4 @@ def contenders(assessed: ObjectTrade, tolerance: float) -> list[str]:
 def _at_best(row: TechniqueTrade, tolerance: float) -> float:
     """Seconds for a pixel if the bias is as small as it may be."""
     left = tolerance**2 - max(row.bias2 - DOUBT * row.bias2_error, 0.0)
-    return max(row.variance / left, row.least) * row.seconds if left > 0 else math.inf
+    return row.time_to(math.sqrt(left)) if left > 0 else math.inf

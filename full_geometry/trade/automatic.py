@@ -1,8 +1,8 @@
 """The cheapest way of rendering a scene that keeps a tolerance, by measurement: "auto", and `render` without a model.
 
 All ways of `assessing.CANDIDATES` may be taken: walks with sampled or precomputed light, denoised too, and models with
-sampled, gathered or corrected light. A way keeps a tolerance if its bias² and what is left of its noise, a standard
-error above what was measured, are within it. Where none is known to, `render` walks until the noise is within it.
+sampled, gathered or corrected light. A way keeps a tolerance if its bias² and what is left of its noise are within it,
+with the doubt of their measurement. Where none is known to, `render` walks until the noise is within it.
 The integrator `bssrdf`, which cannot walk, chooses among models for each object whose model is "auto", with light as it
 states it or, where that is "auto", the cheapest; it refuses a scene in which no model is known to keep the tolerance.
 What was measured is kept in files, so that the same scene gets the same way again; they can be deleted.
@@ -45,7 +45,7 @@ from halfspace_sss.provenance import provenance, write_atomically
 ENVIRONMENT_VARIABLE = "HALFSPACE_SSS_CHOICES"
 DEFAULT = "neural"
 UNNAMED = (*(way.name for way in WALKED), f"{READY_FIRST}, {CORRECTED}")  # where nothing names a model
-FORMAT = "halfspace-sss choice 4"
+FORMAT = "halfspace-sss choice 5"
 
 
 def choices_folder() -> Path:
@@ -175,7 +175,7 @@ def _model(way: str, light: str) -> str:
 def cost(assessed: ObjectTrade, row: TechniqueTrade, tolerance: float) -> float:
     """Seconds of an image until bias and noise are at the tolerance; infinite for what is not known to get there."""
     n = math.inf if row.refusal or not row.variance >= 0 else samples_for(row, tolerance)
-    return row.once + assessed.pixels * max(math.ceil(n), 1) * row.seconds if n < math.inf else math.inf
+    return row.job_seconds(1, assessed.pixels * max(math.ceil(n), 1)) if n < math.inf else math.inf
 
 
 # --------------------------------------------------------------------------------------------------

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from full_geometry.trade.image_differences import check_image
-from halfspace_sss.backend import BackendError
+from halfspace_sss.backend import BackendError, clock
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -65,9 +64,9 @@ def denoised(image: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> tuple
         if np.shape(guide) != pixels.shape:
             raise ValueError(f"{name} must have the shape of the image {pixels.shape}, got {np.shape(guide)}")
     albedo, normal = (np.ascontiguousarray(guide, dtype=np.float32) for guide in (albedo, normal))
-    started = time.perf_counter()
+    started = clock()
     result = oidn.denoise(pixels, albedo=albedo, normal=normal, hdr=True)
-    return np.maximum(np.asarray(result), 0.0), time.perf_counter() - started
+    return np.maximum(np.asarray(result), 0.0), clock() - started
 
 
 class Denoiser:

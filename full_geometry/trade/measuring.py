@@ -12,7 +12,6 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.geometry.sensors import seeded
-from full_geometry.integrators.translucent_walk import SAMPLES_PER_RAY
 from full_geometry.learning.learners import learners
 from full_geometry.scenes.scene_files import first_cause
 from full_geometry.surface.wrapped import surface_of
@@ -40,19 +39,23 @@ from full_geometry.trade.statistics import (
     relative_variance,
     with_prior,
 )
-from full_geometry.trade.techniques import PRECOMPUTED, PRECOMPUTED_WALKS, RAYS, WALKS, Effort, Stage, Technique
+from full_geometry.trade.techniques import PRECOMPUTED, PRECOMPUTED_WALKS, WALKS, Effort, Stage, Technique
 from halfspace_sss.backend import clock
 from halfspace_sss.progress import NamedProgress
 
+TRACED_SHARE = 0.4  # of the time, for the walks that all techniques are compared with
 WALKED = 0.5  # of the time of walks, where delta lights are blurred: the rest tells what that is worth
 # Of the light that walks spread over 0.05 radians, what the blur is off by: from 0.2 to 0.4 radians that light changes
 # by 0.06 +- 0.06 of itself, on a bunny of 2 to 5 mean free paths, where it is 12 % of all.
 BLUR_EFFECT = 0.1
 BLUR_SEEN = 0.04  # probability that a direction is in the cone of `sample_blur`
 FEWEST, POINTS = 64, 5e-3  # of points, and how many times V t
-# Of precomputed light before any measurement: means of images are right to .3 %, points to about 1 %. On a ball of skin
-# under lamp and sky, 1e7 samples gave 4.8e-5 +- 5.4e-5.
-KNOWN_BIAS2 = 1e-4
+# Of precomputed light before any measurement: means of images are right to .3 %, points to about .7 %. On a ball of
+# skin under lamp and sky, 1e7 samples gave 4.8e-5 +- 5.4e-5, on a blob under a sky 0.5e-5 +- 2e-5.
+KNOWN_BIAS2 = 5e-5
+KNOWN_LIGHT = (
+    0.03  # variance of precomputed light as that of a sample, before any measurement: 0.0003 to 0.016 of scenes
+)
 TELLING = (
     0.02  # squared noise of walks at a point, above which their rare bright samples decide what they tell of a bias
 )
@@ -65,12 +68,10 @@ Samples = dict[Technique, "list[Sampled] | str"]  # of an object by each techniq
 
 class RunBudget(NamedTuple):
     """The time or samples that a run of several techniques may take.
-    `seconds`: for each object; with 0 the first samples are all. `samples`: of each exit, instead. `traced`: share of
-    the walks."""
+    `seconds`: for each object; with 0 the first samples are all. `samples`: of each exit, instead."""
 
     seconds: float = 0.0
     samples: int | None = None
-    traced: float = 1.0
 
 
 @dataclass(eq=False)
@@ -133,7 +134,7 @@ class SceneSamples:
             tell(technique.name, done)
             if isinstance(sampled[technique], str):
                 continue
-            share = budget.traced if technique.exact and len(chosen) > 1 else 1 / (len(chosen) - done)
+            share = TRACED_SHARE if technique.exact and len(chosen) > 1 else 1 / (len(chosen) - done)
             if technique.gathers and len(chosen) > 1 and not samples:
                 share = min(share, GATHERED_SHARE)
             for half, part in enumerate(technique.halves):
@@ -175,7 +176,7 @@ class SceneSamples:
     def noise(self, k: int, technique: Technique) -> Number:
         """V t of the samples that tell the bias of a technique, and the seconds that they took."""
         found = self.sampled[k][technique]
-        a, seconds = joined([each.estimate for each in found]), found[-1].seconds
+        a, seconds = joined([each.estimate for each in found]), found[-1].pace
         b = joined([each.estimate for each in self.sampled[k][self.reference(k)]])
         return Number(relative_variance(a, b).value * seconds, a.samples * a.mean.shape[1] * seconds)
 
@@ -274,15 +275,24 @@ def _row(
     variance = relative_variance(cost, b)
     if technique.light == PRECOMPUTED:
         # Rays of light are as many as samples: their noise falls with that of walks.
-        pixels = math.prod(int(n) for n in on.scene.sensors()[0].film().crop_size())
-        noise, samples = noise_of_parts(parts, b), RAYS * SAMPLES_PER_RAY / pixels  # of a pixel
-        variance = Number(variance.value + samples * noise.value, math.hypot(variance.error, samples * noise.error))
+        noise = light_variance(on, parts)
+        variance = Number(variance.value + noise.value, math.hypot(variance.error, noise.error))
     return TechniqueTrade(
         way=technique.name, bias2=bias2.value, bias2_error=bias2.error, ratio=tuple(r[0] for r in ratios),
         ratio_error=tuple(r[1] for r in ratios), variance=variance.value, variance_error=variance.error,
-        seconds=last.seconds, samples=cost.samples * cost.mean.shape[1], preparation=last.preparation,
+        seconds=last.seconds, samples=cost.samples * cost.mean.shape[1],
+        preparation=max(each.preparation for each in sampled),
         compilation=sum(each.compilation for each in sampled), memory=last.memory,
     )  # fmt: skip
+
+
+def light_variance(on: Stage, parts: Sequence[RadianceEstimate]) -> Number:
+    """Variance of precomputed light as that of one sample of a pixel, over the square of the mean radiance.
+    `parts`: walks by two independent ones; of one light that is sampled it is 0."""
+    if len(parts) < 2:
+        return Number(0.0, 0.0)
+    noise = noise_of_parts(tuple(parts), joined(parts))
+    return with_prior(Number(on.lit * noise.value, on.lit * noise.error), KNOWN_LIGHT)
 
 
 def _of_precomputed(walked: Sampled, parts: list[RadianceEstimate]) -> Number:

@@ -14,8 +14,11 @@ from halfspace_sss.noise_free import NoiseFree
 if TYPE_CHECKING:
     import pandas
 
+NOISE = 0.01  # of the mean radiance, to which costs are told
 UNNAMED = "object without an id (give its shape one in the scene)"
-DOUBT = 1.0  # standard errors that count as error: biases spread over decades, and few lie where less is told
+# Standard errors that count as error: biases spread over decades, and few lie where less is told; noise is as likely
+# below what is told as above.
+DOUBT, NOISE_DOUBT = 1.0, 0.5
 
 
 @dataclass(frozen=True)
@@ -25,18 +28,18 @@ class TechniqueTrade:
     Attributes:
         way: its name.
         bias2: squared relative error of radiance that no number of samples removes, noise taken out; it may come out
-            below 0. Mean over visible exits and channels, over the square of the mean radiance. For denoised walks
-            it is the whole squared error of an image of `least` samples of a pixel.
+            below 0. Mean over visible exits and channels, over the square of the mean radiance.
         bias2_error: its standard error.
         ratio, ratio_error: mean radiance over that of walks, for each channel, with standard errors.
         variance, variance_error: of one sample without fireflies (`statistics.FIREFLIES`), over the square of the mean
             radiance, with its standard error.
+        power: a, where the noise² of n samples of a pixel is the variance over n^a; below 1 for denoised walks.
         seconds: of one sample of the object, compilation left out.
         samples: that were taken for this.
+        of_image: seconds of each image beside its samples, which a denoiser takes.
         preparation, compilation: seconds, once for a scene; kernels that were compiled before are found again.
         training: seconds, once for an object; 0 for what needs none.
         memory: most bytes that Dr.Jit held in a launch.
-        least: samples of a pixel that are needed, however large the tolerance is.
         flip, flip_noise: mean FLIP of a small image against that of walks, and of two images of walks; None if the
             evaluator is not installed.
         refusal: why it could not be assessed; all numbers are nan then.
@@ -55,7 +58,8 @@ class TechniqueTrade:
     compilation: float = 0.0
     training: float = 0.0
     memory: int = 0
-    least: int = 1
+    power: float = 1.0
+    of_image: float = 0.0
     flip: float | None = None
     flip_noise: float | None = None
     refusal: str = ""
@@ -95,22 +99,35 @@ class TechniqueTrade:
         """Seconds before the first image."""
         return self.preparation + self.training
 
+    def job_seconds(self, images: int, samples: float) -> float:
+        """Seconds of so many images that take so many samples of the object each."""
+        return self.once + images * (samples * self.seconds + self.of_image)
+
     def time_to(self, noise: float) -> float:
         """Seconds for each pixel of the object until its noise is so much of the mean radiance."""
-        return self.variance / noise**2 * self.seconds
+        return (self.variance / noise**2) ** (1 / self.power) * self.seconds
+
+    @property
+    def cost(self) -> float:
+        """Variance of a sample times its seconds; of denoised walks what plain ones as good at 1 % would have."""
+        return self.time_to(NOISE) * NOISE**2
+
+    def noise2(self, spp: float) -> float:
+        """Squared relative noise of so many samples of a pixel."""
+        return self.variance / spp**self.power
 
 
 def samples_for(row: TechniqueTrade, tolerance: float) -> float:
-    """Samples n of a pixel that bring bias² + variance / n and z of its standard errors to tolerance²; inf for none.
+    """Samples n of a pixel that bring bias² + noise² and what counts of their errors to tolerance²; inf for none.
 
-    With a = tolerance² - bias² and z = DOUBT the smaller root of (a - V / n)² = z² (s² + (v / n)²); at least `least`.
+    With a = tolerance² - bias² and x = n^power the smaller root of (a - V / x)² = s² + (v / x)².
     """
-    a, s, v = tolerance**2 - max(row.bias2, 0.0), DOUBT * row.bias2_error, DOUBT * row.variance_error
+    a, s, v = tolerance**2 - max(row.bias2, 0.0), DOUBT * row.bias2_error, NOISE_DOUBT * row.variance_error
     if not a > s:
         return math.inf
     V = row.variance
-    n = (a * V + math.sqrt(max(a**2 * V**2 - (V**2 - v**2) * (a**2 - s**2), 0.0))) / (a**2 - s**2)
-    return max(n, row.least)
+    x = (a * V + math.sqrt(max(a**2 * V**2 - (V**2 - v**2) * (a**2 - s**2), 0.0))) / (a**2 - s**2)
+    return x ** (1 / row.power)
 
 
 @dataclass(frozen=True)

@@ -20,19 +20,19 @@ from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.integrators.correction import FEWEST as FEWEST_WALKS
 from full_geometry.integrators.correction import SAMPLES_PER_WALK
 from full_geometry.integrators.gathering import PART
-from full_geometry.integrators.translucent_walk import SAMPLES_PER_RAY
 from full_geometry.precomputed.transport_matrix import R_2
 from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.settings import variant_channels
 from full_geometry.surface.wrapped import surface_of
 from full_geometry.trade.statistics import RadianceEstimate
-from full_geometry.trade.techniques import CORRECTED, PRECOMPUTED, RAYS, Stage, Technique
+from full_geometry.trade.techniques import CORRECTED, FEWEST_LIT, MOST_LIT, PRECOMPUTED, Stage, Technique
 from halfspace_sss.backend import clock
 
 LANES = 2**18  # of a launch
 PILOT, FEWEST = 48, 8  # samples of each exit of the first launch, and of a launch that is worth it
 LEAST_SHARE = 0.2  # of the time of a launch that its samples take
 BLUR = 8.0  # 0.4 radians
+FILLING = 0.4  # seconds for each part of precomputed light, whose rays are as many as that allows
 
 
 @dataclass(eq=False)
@@ -41,14 +41,14 @@ class Sampled:
 
     Attributes:
         estimate: radiance of the exits.
-        preparation: seconds, of tables, surveys and gathering of all light, once for a scene.
+        preparation: seconds, of tables, cells, surveys and gathering of all light, once for a scene.
         preparing: seconds that it took here, where a part of the light is gathered; 0 if it was known.
         compilation: seconds of the first launch beyond those of the same one again, if it compiled a kernel, by the
             clock on the wall.
         compiling: the same by `clock`.
         overhead: seconds of a launch whatever its samples: its paths are recorded, and their kernel is found again.
         launches: (samples of all exits, seconds) of each launch that compiled nothing.
-        beside: seconds of walks that a sample brings along, of corrected light.
+        beside: seconds that a sample brings along, of walks for corrected light, or of precomputed light.
         memory: most bytes that Dr.Jit held while it ran.
         blur: of walks in a scene with delta lights, what of their light is blurred, see `sample_blur`.
     """
@@ -65,9 +65,14 @@ class Sampled:
     blur: RadianceEstimate | None = None
 
     @property
-    def seconds(self) -> float:
+    def pace(self) -> float:
         """Seconds of one sample, the least of all launches, without the overhead of a launch, as images are larger."""
-        return self.beside + min(max(took - self.overhead, LEAST_SHARE * took) / n for n, took in self.launches)
+        return min(max(took - self.overhead, LEAST_SHARE * took) / n for n, took in self.launches)
+
+    @property
+    def seconds(self) -> float:
+        """Seconds of one sample of an image."""
+        return self.beside + self.pace
 
 
 def first_sample(
@@ -86,7 +91,12 @@ def first_sample(
         preparation += same.preparation if same else 0.0
     result = Sampled(RadianceEstimate(variant_channels(), exits.n), preparation, preparing)
     if technique.light == CORRECTED:  # larger images have more walks
-        result.beside = _beside(stage, exits, stage.integrator(technique).corrections.seconds)
+        seconds = stage.integrator(technique).corrections.seconds
+        result.beside = seconds / (FEWEST_WALKS * SAMPLES_PER_WALK) / max(exits.share, 1e-9)
+    if technique.light == PRECOMPUTED:  # and more light
+        filling = stage.integrator(technique).filling
+        result.preparation = max(preparation - filling, 0.0)
+        result.beside = filling / stage.light_samples / max(exits.share, 1e-9)
     _first_launch(stage, technique, exits, result, each, seeded(seed, 31))
     stage.paces[object, technique] = result
     return result
@@ -106,11 +116,6 @@ def _prepared_in(stage: Stage, technique: Technique) -> float:
     started = clock()
     _prepare(stage, technique)
     return clock() - started
-
-
-def _beside(stage: Stage, exits: Exits, seconds: float) -> float:
-    """Seconds of walks that a sample of the object brings along, beyond those that every image has."""
-    return seconds / (FEWEST_WALKS * SAMPLES_PER_WALK) / max(exits.share, 1e-9)
 
 
 def _first_launch(stage: Stage, technique: Technique, exits: Exits, sampled: Sampled, each: int, seed: int) -> None:
@@ -137,6 +142,8 @@ def warm_up(stage: Stage, techniques: Sequence[Technique]) -> None:
         () if any(technique in [known for _, known in stage.paces] for technique in techniques) else techniques
     ):
         with contextlib.suppress(ValueError, RuntimeError):
+            if technique.light == PRECOMPUTED:
+                stage.light_samples = FEWEST_LIT
             _prepare(stage, technique)
             stage.forget(technique)
             return
@@ -145,7 +152,11 @@ def warm_up(stage: Stage, techniques: Sequence[Technique]) -> None:
 def _prepare(stage: Stage, technique: Technique) -> None:
     integrator, scene = stage.integrator(technique), stage.scene
     if technique.light == PRECOMPUTED:
-        integrator.prepare(scene, RAYS * SAMPLES_PER_RAY, technique.part)
+        integrator.prepare(scene, stage.light_samples, technique.part)
+        most = int(stage.light_samples * FILLING / max(integrator.filling, 1e-9))
+        if technique.part == 1 and stage.light_samples == FEWEST_LIT and most > 2 * FEWEST_LIT:
+            stage.light_samples = min(most, MOST_LIT)
+            integrator.prepare(scene, stage.light_samples, technique.part)
     else:
         (integrator.prepare if is_bssrdf(integrator) else integrator.tracer)(scene)
 
@@ -168,7 +179,7 @@ def sample_more(
             each = samples - sampled.estimate.samples
         else:
             left = max(seconds - (clock() - started) - sampled.overhead, 0)
-            each = int(left / (sampled.seconds * exits.n))
+            each = int(left / (sampled.pace * exits.n))
         if not sampled.estimate.samples:
             each = max(each, PILOT)
         if each < FEWEST:

@@ -97,6 +97,11 @@ class RadianceEstimate:
         return values[order[:-1]], exits[order[:-1]], float(values[order[-1]])
 
     @property
+    def limits(self) -> np.ndarray:
+        """The brightest samples of each channel that are no fireflies; infinite where too few are known."""
+        return np.array([self._fireflies(c)[2] or np.inf for c in range(len(self.first))])
+
+    @property
     def doubt(self) -> float:
         """Standard error of the mean of `steady_variance`, as which samples are left out is chance: each counts as
         the square of the next brightest."""
@@ -187,8 +192,8 @@ def noise_of_parts(parts: tuple[RadianceEstimate, RadianceEstimate], b: Radiance
 
 
 def with_prior(found: Number, error: float) -> Number:
-    """With 0 ± `error` that was known before, by weights 1 / error²; alone where it is two of its errors off."""
-    if not abs(found.value) < 2 * found.error:
+    """With 0 ± `error` that was known before, by weights 1 / error²; alone where it is three of its errors off."""
+    if not abs(found.value) < 3 * found.error:
         return found
     share = error**2 / (error**2 + found.error**2)
     return Number(share * found.value, found.error * share**0.5)
@@ -223,10 +228,3 @@ def _ratio(top: np.ndarray, bottom: np.ndarray, power: int) -> Number:
     tops, bottoms = (top.sum() - top) / (n - 1), (bottom.sum() - bottom) / (n - 1)
     parts = tops / np.maximum(bottoms, 1e-300) ** power
     return Number(float(whole), float(np.sqrt((n - 1) * np.mean((parts - parts.mean()) ** 2))))
-
-
-def ratio(top: np.ndarray, bottom: np.ndarray) -> Number:
-    """Σ top / Σ bottom, with its standard error by the jackknife over what is summed."""
-    rest = (top.sum() - top) / np.maximum(bottom.sum() - bottom, 1e-300)
-    n = len(top)
-    return Number(float(top.sum() / bottom.sum()), float(np.sqrt((n - 1) / n * np.sum((rest - rest.mean()) ** 2))))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,8 @@ LAMBERT = "lambert"
 READY_FIRST = "better_dipole"
 GATHERED, CORRECTED, PRECOMPUTED = *GATHERED_LIGHTS, "precomputed"
 DENOISED = ", denoised"
-RAYS = 2**19  # of light precomputed for walks, for each object: its noise at a point is 3 to 8 %
+# Samples of the images that light is precomputed for: the noise of the most at a point is 3 to 8 %.
+FEWEST_LIT, MOST_LIT = 2**17, 2**21
 
 
 @dataclass(frozen=True)
@@ -107,18 +109,25 @@ def techniques() -> list[Technique]:
 class Stage:
     """A loaded scene, and the integrators of several techniques for it.
     `settings`: of its integrator, by parameter name. `bssrdf`: parameters that `bssrdf` alone understands. `paces`:
-    first `Sampled` of earlier runs by (object, technique), so that the next run knows what a sample takes."""
+    first `Sampled` of earlier runs by (object, technique), so that the next run knows what a sample takes.
+    `light_samples`: of the image that light is precomputed for."""
 
     scene: mi.Scene
     shapes: list[mi.Shape]
     settings: dict[str, Any]
     bssrdf: dict[str, Any]
     paces: dict[tuple[int, Technique], Any] = field(default_factory=dict)
+    light_samples: int = MOST_LIT
     _integrators: dict[Technique, mi.Integrator] = field(default_factory=dict)
 
     @property
     def mm_per_unit(self) -> float:
         return float(self.settings["mm_per_unit"])
+
+    @property
+    def lit(self) -> float:
+        """Samples of a pixel that light is precomputed for."""
+        return self.light_samples / math.prod(int(n) for n in self.scene.sensors()[0].film().crop_size())
 
     @property
     def names(self) -> list[str]:
@@ -147,6 +156,9 @@ class Stage:
             # spectral variants refuse gathered light
             if technique.light == GATHERED and sampled is not None and not mi.is_spectral:
                 self._integrators[technique].take_over(sampled)
+            first = self._integrators.get(replace(technique, part=1))
+            if technique.walks and technique.part > 1 and first is not None:
+                self._integrators[technique].take_over(first)
         return self._integrators[technique]
 
     def forget(self, technique: Technique) -> None:
@@ -184,7 +196,6 @@ def _settings(scene: mi.Scene) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 EXITS = 480  # few: their choice makes 3 % of a bias uncertain, and each gets the more samples
-TRACED_SHARE = 0.4  # of the time, for the walks that all techniques are compared with
 
 
 @dataclass(frozen=True)
@@ -212,14 +223,12 @@ class Effort:
         seconds: for each object, shared by all techniques, compilation left out.
         samples: of each exit by each technique, in place of seconds; the outcome then depends on the seed alone.
         exits: points of each object.
-        traced: share of the time for walks.
         seed: of everything; what depends on the clock is how many samples are taken.
     """
 
     seconds: float = 4.0
     samples: int | None = None
     exits: int = EXITS
-    traced: float = TRACED_SHARE
     sensor: int = 0
     seed: int = 0
 

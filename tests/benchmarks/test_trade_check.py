@@ -1,4 +1,4 @@
-"""Random scenes, and their long runs, which go on where they stopped."""
+"""Random scenes, and their records, which are measured once."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import long_runs, trade_check
+from benchmarks import trade_check
 from benchmarks.random_scenes import random_scene, write_scene
 
 mi = pytest.importorskip("mitsuba")
@@ -31,12 +31,11 @@ def test_a_random_scene_is_closed_and_faces_outwards(number: int, tmp_path: Path
     assert found.closed and found.upright and found.size == pytest.approx(100, rel=0.01)
 
 
-def test_the_check_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-
+def test_a_scene_that_was_measured_is_not_measured_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trade_check, "WAYS", ("path_traced", "lambert"))
     first = trade_check.check_scene(random_scene(1, 1), tmp_path, 0.2, 0.3)
     monkeypatch.setattr(trade_check, "assess_for", None)
-    monkeypatch.setattr(long_runs, "assess_stage", None)
+    monkeypatch.setattr(trade_check, "assess_stage", None)
     again = trade_check.check_scene(random_scene(1, 1), tmp_path, 0.2, 0.3)
     assert json.dumps(again) == json.dumps(first)
     found = trade_check.outcome(first)
