@@ -21,8 +21,8 @@ Directions of that light are held by its flux and second moments, of each cell a
     ∫ p(w.w') L_0(x, w') dw' = phi(x) / (4 pi) (q_0 + 3 q_1 w.f + 5/2 q_2 (3 w^T M w - 1)).
 
 This is exact for phase functions of three Legendre coefficients q_l. Others are split (`forward_scattering`): L_0 then
-is light that has met forward events alone, and rays go on through those. Where a medium varies in space, rays cannot do
-that: phase functions are cut after q_2 = g² instead, and MOST_TRUNCATED bounds g.
+is light that has met forward events alone, and rays go on through those. Where a medium has textures, so that each walk
+takes its own, rays cannot do that: phase functions are cut after q_2 = g² instead, and MOST_TRUNCATED bounds g.
 """
 
 from __future__ import annotations
@@ -47,6 +47,7 @@ from full_geometry.precomputed.scattered_light import ScatteredLight
 from full_geometry.precomputed.transport_matrix import R_2
 from full_geometry.walk.media import WalkMedia
 from full_geometry.walk.random_walk import Event, fly, free_path, pick, sample_bsdf, turn
+from halfspace_sss.physics.medium import Medium
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 EDGE, FORWARD_EDGE = 0.9, 0.6  # of cells, mean free paths of the light in them
@@ -56,7 +57,7 @@ DEPTHS = 3.6, 9.0  # mean free paths below the surface, at which cells are coars
 ALONG, FORWARD_ALONG = 6, 1  # points on a segment of a ray; forward events part it into many
 FEWEST_POINTS, MOST_POINTS = 2**14, 2**18  # of the surface that find its cells, of all and at once
 MOST_INTEGER = 2**15 - 1  # of 16 bits, for a direction of 1
-MOST_TRUNCATED = 0.5  # abs(g) of media that vary or have textures, above which three coefficients are too few
+MOST_TRUNCATED = 0.5  # abs(g) beside textures of media, above which three coefficients are too few
 FEWEST_PATHS = 2**14  # of scattered light, from each object
 ROULETTE = 0.1  # part of its light below which a reflected ray may end
 
@@ -227,9 +228,9 @@ def obstacle(media: WalkMedia) -> str:
         if inside.orders != "total":
             return f"orders of object {obj.name} are {inside.orders!r}"
         if not forward(media) and np.max(np.abs(inside.medium.g)) > MOST_TRUNCATED:
-            return f"abs(g) of object {obj.name} is above {MOST_TRUNCATED} in a scene where a medium varies"
+            return f"abs(g) of object {obj.name} is above {MOST_TRUNCATED} in a scene with textures of media"
     for k, kind in enumerate(media.instance_table.kind):
-        h = _grid(media, k)[1] * float(np.mean(_extinction(media, kind)))
+        h = _grid(media, k)[1] * float(np.mean(_extinction(media, media.specs[kind].medium)))
         if h > MOST_EDGE:
             return f"object {media.objects[kind].name} is so many mean free paths wide that cells have {h:.2g}"
     return ""
@@ -261,8 +262,11 @@ def _grid(media: WalkMedia, k: int) -> tuple[tuple[np.ndarray, np.ndarray], floa
     """The box of object k, the edge of its cells, and the depths beyond which they are coarse and end, scene units."""
     kind = media.instance_table.kind[k]
     low, high = ends_of(corners(media.objects[kind].scene.bbox(), to_world(media, k)[None]))
-    edge, extinction = FORWARD_EDGE if forward(media) else EDGE, _extinction(media, kind)
-    depths = (np.inf, np.inf) if media.varies else tuple(depth / float(np.min(extinction)) for depth in DEPTHS)
+    edge, extinction = FORWARD_EDGE if forward(media) else EDGE, _extinction(media, media.specs[kind].medium)
+    varying, least = media.specs[kind].varying, extinction
+    if varying is not None:  # of grids, light may reach any depth
+        least = np.array([_extinction(media, each) for each in varying.media]) if varying.by_depth else np.zeros(1)
+    depths = tuple(np.divide(DEPTHS, np.min(least)).tolist()) if np.min(least) > 0 else (np.inf, np.inf)
     box, (area, volume) = (low[0], high[0]), _extent(media, k)
     # thin objects have finer cells: of .9 mean free paths they left 2 % RMS of bias in images of a blob of 5.4
     fine = max(4 * volume / (area * ACROSS), (volume / FINE_CELLS) ** (1 / 3))
@@ -288,15 +292,14 @@ def _surface_points(media: WalkMedia, k: int, area: float, density: float) -> It
         yield entries(media, k, [dr.minimum(u, 1 - 2**-24), *multiples(R_2, (0.5, 0.5), width, part * width)])
 
 
-def _extinction(media: WalkMedia, kind: int) -> np.ndarray:
-    """Of the light that is precomputed, by channel, 1/(scene unit)."""
-    medium = media.specs[kind].medium
+def _extinction(media: WalkMedia, medium: Medium) -> np.ndarray:
+    """Of the light that is precomputed in a medium, by channel, 1/(scene unit)."""
     return media.mm_per_unit * (split_extinction(medium) if forward(media) else np.atleast_1d(medium.sigma_t))
 
 
 def forward(media: WalkMedia) -> bool:
-    """Whether rays of light go on through forward events: some medium is uneven in direction, none in space."""
-    return not (media.varies or media.carried) and any(np.any(spec.medium.g) for spec in media.specs)
+    """Whether rays of light go on through forward events: some medium is uneven in direction, none of each walk."""
+    return not media.carried and any(np.any(spec.medium.g) for spec in media.specs)
 
 
 @dataclass
@@ -398,9 +401,13 @@ class _Rays:
         # ---- flux T / p at the surface, flux sigma_s T / p at an event, p the mean over channels
         m = media.coefficients(self.k, ray.o)
         t = free_path(m, ray.channel, rng.next_float32())
-        flight = fly(m, ray.flux, ray.density, ray.channel, t, far)
-        ray = replace(ray, flux=flight.weight, density=flight.density)
-        at_surface = self._reflect(ray, si, alive & ~flight.scatters, ray.T)
+        if media.varies:
+            t, flux, density, scatters, rng = self._collide(ray, t, far, alive)
+        else:
+            flight = fly(m, ray.flux, ray.density, ray.channel, t, far)
+            flux, density, scatters = flight.weight, flight.density, flight.scatters
+        ray = replace(ray, flux=flux, density=density)
+        at_surface = self._reflect(ray, si, alive & ~scatters, ray.T)
 
         # ---- a turn by the phase function, of which 1 - q is forward
         u = mi.Point2f(rng.next_float32(), rng.next_float32())
@@ -409,14 +416,33 @@ class _Rays:
 
         # ---- roulette
         survive = dr.minimum(dr.max(dr.abs(flux)) / dr.maximum(ray.entered * ROULETTE, 1e-30), 1)
-        alive = alive & flight.scatters & (rng.next_float32() < survive)
+        alive = alive & scatters & (rng.next_float32() < survive)
         at_event = replace(
             ray, o=mi.Point3f(ray.o + ray.d * t), d=d, off=media.behind(self.k, d),
             flux=flux / dr.maximum(survive, 1e-20), density=density, alive=alive,
         )  # fmt: skip
         a, b = vars(at_event), vars(at_surface)
-        state = {key: dr.select(flight.scatters, a[key], b[key]) for key in a if key != "rng"}
+        state = {key: dr.select(scatters, a[key], b[key]) for key in a if key != "rng"}
         return _Ray(**state, rng=rng)
+
+    def _collide(self, ray: _Ray, t: mi.Float, far: mi.Float, alive: mi.Bool) -> tuple:
+        """The distance of the first collision that is not null, where a medium varies, the flux and density there or at
+        the surface, whether it is before that, and the random numbers. `t`: of the first collision."""
+        channel = ray.channel
+
+        def fly_on(
+            start: mi.Float, t: mi.Float, flux: mi.Spectrum, density: mi.Spectrum, scatters: mi.Bool, going: mi.Bool,
+            rng: mi.PCG32,
+        ) -> tuple:  # fmt: skip
+            # the flight from the last collision at `start`
+            m = self.media.coefficients(self.k, ray.o + ray.d * t)
+            flight = fly(m, flux, density, channel, t - start, far - start, rng.next_float32())
+            later = t + free_path(m, channel, rng.next_float32())
+            return t, dr.select(flight.null, later, t), flight.weight, flight.density, flight.scatters, flight.null, rng
+
+        state = mi.Float(0), t, ray.flux, ray.density, mi.Bool(False), alive, ray.rng
+        _, t, flux, density, scatters, _, rng = dr.while_loop(state, lambda *s: s[5], fly_on, label="collisions")
+        return t, flux, density, scatters, rng
 
     def _add(self, ray: _Ray, far: mi.Float, active: mi.Bool) -> None:
         """Add light to the cells at points of a segment, drawn by mean_c sigma_c T_c / (1 - T_c(far))."""

@@ -255,6 +255,15 @@ def test_precomputed_light_around_what_lies_inside_has_the_mean_of_sampled_light
 
 
 @pytest.mark.slow
+def test_precomputed_light_has_the_mean_of_sampled_light_where_forward_scattering_varies_in_space() -> None:
+    values = np.random.default_rng(3).uniform(0.4, 4.0, (4, 4, 4, 3)).astype(np.float32)
+    to_world = mi.ScalarTransform4f().translate([-5, -5, -5]).scale(10)
+    grid = {"type": "gridvolume", "grid": mi.VolumeGrid(values), "to_world": to_world, "raw": True}
+    surface = {"sigma_t": grid, "albedo": "0.99,0.95,0.9", "g": 0.8, "eta": 1.4}
+    _compare(surface, 0.02, lamp=_lamp(20.0), sky={"type": "constant", "radiance": 0.2})
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["cube", "sky", "point", "sun", "floor", "two", "instances", "rough", "albedo"])
 def test_precomputed_light_has_the_mean_of_sampled_light(case: str) -> None:
     lamp, floor = {"lamp": _lamp()}, {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": 0.6}}
@@ -389,7 +398,7 @@ def test_the_layer_of_emission_holds_the_mirror_and_what_is_behind_the_object() 
     ("surface", "other", "reason"),
     [
         ({**MEDIUM, "orders": "single"}, None, "orders of object 'object' are 'single'"),
-        ({**PAINTED, "g": 0.8}, None, r"abs\(g\) of object 'object' is above 0.5 in a scene where a medium varies"),
+        ({**PAINTED, "g": 0.8}, None, r"abs\(g\) of object 'object' is above 0.5 in a scene with textures of media"),
         ({**MEDIUM, "sigma_s": 1e4}, None, "so many mean free paths wide"),
         (MEDIUM, {"type": "sphere", "center": [7, 0, 0], "radius": 4.0}, "objects overlap"),
     ],
