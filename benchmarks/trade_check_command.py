@@ -24,7 +24,7 @@ def check_command(
     seed: Annotated[int, typer.Option(help="Other seeds draw other scenes.", parser=whole)] = 0,
     tolerance: Annotated[float | None, typer.Option(help="Tolerance of all scenes; by default drawn for each.")] = None,
     assess: Annotated[float, typer.Option(help="Seconds of measuring for a recommendation.")] = 4.0,
-    truth: Annotated[float, typer.Option(help="Most seconds of the long runs, with seeds of their own.")] = 24.0,
+    truth: Annotated[float, typer.Option(help="Seconds of a long run for each denoised way.")] = 24.0,
     write_only: Annotated[bool, typer.Option("--write-only", help="Write the scenes, measure nothing.")] = False,
     variant: Variant = "llvm_ad_rgb",
     out: Annotated[Path, typer.Option(help="Folder; scenes that were measured there are not measured again.")] = Path(

@@ -74,11 +74,10 @@ INTRODUCTION = """\
 # The advice of `trade` on random scenes
 
 Written by `python -m benchmarks trade-check` ({arguments}): random scenes of shape x medium x light x size x tolerance.
-Each scene has {assess:g} s for a recommendation among {ways} ways, and up
-to {truth:g} s of long runs with exits and samples of their own. A long run ends when bias² is known to a fifth of the
-squared tolerance and variances to 15 %. Times are those of the processor, all cores together,
-preparation included. *Always* is the cost of one fixed choice where it can keep the tolerance, with as many samples as
-the long runs say.
+Each scene has {assess:g} s for a recommendation among {ways} ways, and a long run with exits and samples of its
+own: {truth:g} s for each denoised way, or until its squared error is known to 5 %, a quarter of that for all others.
+Times are those of the processor, all cores together, preparation included. *Always* is the cost of one fixed choice
+where it can keep the tolerance, with as many samples as the long runs say.
 """
 
 
@@ -98,8 +97,8 @@ def markdown(values: JsonDict, table: pandas.DataFrame, how: JsonDict) -> str:
         INTRODUCTION.format(arguments=f"`{arguments}`", ways=len(WAYS), **{k: how[k] for k in ("assess", "truth")}),
         f"{values['kept']} of {n} recommendations keep their tolerance (within two standard errors of the long run), "
         f"{values['cheap']} cost at most {DEAR:g} times the cheapest way that does by the long run, "
-        f"{values['surely_cheap']} of the cheapest that does by two of its standard errors; an assessment took at most "
-        f"{values['assess_s']:.2g} s of the processor, compilation left out.",
+        f"{values['surely_cheap']} of the cheapest with the doubt that a recommendation counts; an assessment took at "
+        f"most {values['assess_s']:.2g} s of the processor, compilation left out.",
         "",
         f"(bias² of the assessment - bias² of the long run) over their standard errors, {z['count']} pairs: mean "
         f"{z['mean']:+.2f}, standard deviation {z['sd']:.2f}, {100 * z['beyond_2']:.1f} % beyond 2, "
