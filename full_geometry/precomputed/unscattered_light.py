@@ -214,6 +214,8 @@ def obstacle(media: WalkMedia) -> str:
     if media.overlaps:
         return "objects overlap"
     if media.inner is not None:
+        if media.inner.instance_table.repeated:
+            return "something lies inside an instance, or is one inside an object"
         try:
             media.holes  # noqa: B018
         except ValueError as error:
