@@ -415,7 +415,7 @@ def _ahead(media: WalkMedia, k: mi.Int32, ray: mi.Ray3f) -> tuple[mi.Float, mi.B
         here = mi.Ray3f(ray.o + ray.d * t, ray.d)
         si = media.instance_scene.intersect(scene, here, mi.RayFlags.Minimal, active=going)
         hit, along, t = going & si.is_valid(), dr.dot(si.n, ray.d), t + si.t
-        bounds = own = hit & ((media.met(si, k) if media.inner is None else media.index_of(si, hit)) == k)
+        bounds = own = hit & (media.met(si, k) == k)
         inside &= ~own | (met & 1 != 0) | (along * media.side(k, si.prim_index) > 0)
         met |= dr.select(own, mi.UInt32(1), 0)
 

@@ -214,8 +214,6 @@ def obstacle(media: WalkMedia) -> str:
     if media.overlaps:
         return "objects overlap"
     if media.inner is not None:
-        if media.inner.instance_table.repeated:
-            return "something lies inside an instance, or is one inside an object"
         try:
             media.holes  # noqa: B018
         except ValueError as error:
@@ -379,7 +377,7 @@ class _Rays:
 
         # ---- reflection: flux F, with roulette; behind an object that overlaps the ray goes on, and behind its own
         # boundary if rounding has put it outside; a shape in the object ends it
-        met = (media.index_of(si, alive) if media.inner else media.met(si, self.k)) == self.k
+        met = media.met(si, self.k) == self.k
         if media.inner is not None:
             alive = alive & (media.inner.around(si) != self.k)
         si = media.seen(si, self.k, d)

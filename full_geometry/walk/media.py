@@ -403,9 +403,10 @@ class WalkMedia:
         tables["shares"] = per_channel([_shares(m) for m in media], 1.0)
         tables["eta"] = mi.Float([m.eta for m in media])
 
-        # ---- sides of geometric normals: one per shape, or one per face
+        # ---- sides of geometric normals: one per object, or one per face of all shapes
         sides = [[obj.sign] if obj.signs is None else np.array(obj.signs).tolist() for obj in self.objects]
-        tables["side"] = mi.Float(sum(sides, []))
+        one_each = all(obj.signs is None for obj in self.objects)
+        tables["side"] = mi.Float(sum([sides[kind] for kind in instance_table.kind] if one_each else sides, []))
         tables["first"] = mi.UInt32(np.cumsum([0, *map(len, sides)])[instance_table.kind].tolist())
         tables["step"] = mi.UInt32([int(len(sides[kind]) > 1) for kind in instance_table.kind])
 
@@ -626,8 +627,9 @@ class WalkMedia:
         return self.instance_table.number(si, active)
 
     def met(self, si: mi.SurfaceInteraction3f, k: mi.Int32) -> mi.Int32:
-        """The number of the object whose boundary a ray inside object k has met."""
-        return k if len(self.objects) == 1 and not self.instance_table.repeated else self.index_of(si)
+        """The number of the object whose boundary a ray inside object k has met; -1 of what is no object in there."""
+        alone = len(self.objects) == 1 and not self.instance_table.repeated and self.inner is None
+        return k if alone else self.index_of(si)
 
     def boundary(self, k: mi.Int32) -> mi.BSDF | mi.BSDFPtr:
         """The dielectric of object k: one BSDF, or a pointer in each lane."""

@@ -82,6 +82,15 @@ def agree(found: np.ndarray, wanted: np.ndarray, known_to: float) -> None:
         assert (error < times * known_to * b.mean(axis=0)).all()
 
 
+def test_each_instance_knows_the_side_of_its_normals() -> None:
+    from full_geometry.walk.media import WalkMedia
+
+    inwards = {"type": "sphere", "radius": 0.5, "flip_normals": True, "bsdf": SEED}
+    parts = {"ball": inwards, "other": {**inwards, "flip_normals": False, "center": [2, 0, 0]}}
+    media = WalkMedia.of(mi.load_dict(view(**shown(parts, [turned(5.0 * k, 0) for k in range(3)]))), 1.0)
+    assert np.array(media.side(mi.Int32([*range(6)]), mi.UInt32(0))).tolist() == [-1.0] * 3 + [1.0] * 3
+
+
 @pytest.mark.slow
 def test_turned_stretched_and_mirrored_instances_look_like_such_meshes() -> None:
     found, wanted = (images(view(**light(), **made({"box": box()}, stretched())), 256, seed)
