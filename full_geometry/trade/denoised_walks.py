@@ -35,7 +35,7 @@ from full_geometry.geometry.sensors import seeded
 from full_geometry.objects.objects import translucent_shapes
 from full_geometry.trade.denoising import GUIDE_SPP, GUIDES, denoised, guides_of
 from full_geometry.trade.images import film_of, pixel_means, pixels_of
-from full_geometry.trade.results import DOUBT, NOISE_DOUBT, TechniqueTrade
+from full_geometry.trade.results import DOUBT, TechniqueTrade
 from full_geometry.trade.statistics import Number
 from full_geometry.trade.techniques import Stage, Technique
 from halfspace_sss.backend import clock
@@ -372,7 +372,7 @@ class ErrorLaw(NamedTuple):
         left = (tolerance or 0.0) ** 2 - max(plain.bias2, 0.0)
         for n in SAMPLES if left > 0 else ():
             e = self.at(n)
-            if e.value + math.hypot(NOISE_DOUBT * e.error, DOUBT * plain.bias2_error) <= left:
+            if e.value + DOUBT * math.hypot(e.error, plain.bias2_error) <= left:
                 return float(n)
         return float(measured)
 

@@ -16,9 +16,7 @@ if TYPE_CHECKING:
 
 NOISE = 0.01  # of the mean radiance, to which costs are told
 UNNAMED = "object without an id (give its shape one in the scene)"
-# Standard errors that count as error: biases spread over decades, and few lie where less is told; noise is as likely
-# below what is told as above.
-DOUBT, NOISE_DOUBT = 1.0, 0.5
+DOUBT = 1.0  # standard errors that count as error: biases spread over decades, and few lie where less is told
 
 
 @dataclass(frozen=True)
@@ -122,7 +120,7 @@ def samples_for(row: TechniqueTrade, tolerance: float) -> float:
 
     With a = tolerance² - bias² and x = n^power the smaller root of (a - V / x)² = s² + (v / x)².
     """
-    a, s, v = tolerance**2 - max(row.bias2, 0.0), DOUBT * row.bias2_error, NOISE_DOUBT * row.variance_error
+    a, s, v = tolerance**2 - max(row.bias2, 0.0), DOUBT * row.bias2_error, DOUBT * row.variance_error
     if not a > s:
         return math.inf
     V = row.variance

@@ -119,12 +119,12 @@ def test_the_kept_noise_of_gathered_parts_is_half_that_of_light_and_a_part_of_th
 
 
 @pytest.mark.parametrize(("bias2", "bias2_error", "error"), [(0.0, 0.0, 0.1), (4e-4, 3e-4, 0.3), (-1e-3, 5e-4, 2.0)])
-def test_as_many_samples_are_taken_as_keep_the_tolerance_with_the_doubt_of_what_was_measured(
+def test_as_many_samples_are_taken_as_keep_the_tolerance_one_standard_error_above_what_was_measured(
     bias2: float, bias2_error: float, error: float
 ) -> None:
     row = TechniqueTrade("neural", bias2, bias2_error, (1.0,), (0.0,), 1.0, error, 1e-6, 100)
     n, tolerance = samples_for(row, 0.05), 0.05
-    bound = max(bias2, 0) + 1 / n + math.hypot(bias2_error, 0.5 * error / n)
+    bound = max(bias2, 0) + 1 / n + math.hypot(bias2_error, error / n)
     assert bound == pytest.approx(tolerance**2, rel=1e-9)
     assert samples_for(row, 0.01) == math.inf or bias2_error == 0
 
