@@ -113,7 +113,8 @@ def test_instances_inside_an_object_look_like_objects_there() -> None:
     seed = {"type": "sphere", "radius": 0.4, "bsdf": SEED}
     glass = {"type": "sphere", "radius": 0.2, "bsdf": {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.2}}
     jelly = {"jelly": {"type": "sphere", "radius": 2.5, "bsdf": surface(orders="total")}}
-    found, wanted = (images(view(**light(), **jelly, **made({"seed": seed, "glass": glass}, places())), 256, start)
+    sampled, parts = {"type": "translucent_walk", "light": "sampled"}, {"seed": seed, "glass": glass}
+    found, wanted = (images(view(sampled, **light(), **jelly, **made(parts, places())), 256, start)
                      for start, made in ((1, shown), (1001, direct)))  # fmt: skip
     agree(found, wanted, 0.01)
 
