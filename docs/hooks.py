@@ -1,11 +1,14 @@
-"""Hooks of MkDocs: small pictures, which load when they come near, colours of code in both modes, and a notebook beside
-each script with cells, whose first cell installs what it needs, as Colab wants it.
+"""Hooks of MkDocs: small pictures, which load when they come near, colours of code in both modes, images of the pages
+in `flip/` as files, which load when they are shown, and a notebook beside each script with cells, whose first cell
+installs what it needs, as Colab wants it.
 """
 
 from __future__ import annotations
 
+import base64
 import json
 import re
+from itertools import count
 from pathlib import Path
 
 from mkdocs.config.defaults import MkDocsConfig
@@ -15,6 +18,7 @@ from pygments.formatters import HtmlFormatter
 
 WIDTH = 1000  # pixels, more than the column of a page has
 PICTURE = re.compile(r'src="(?P<up>(?:\.\./)*)(?P<name>[\w-]+)\.png"')
+EMBEDDED = re.compile(r'"data:image/(\w+);base64,([^"]+)"')
 CELL = re.compile(r"^# %%(?: \[(markdown)\])?\n", re.MULTILINE)
 INSTALL = re.compile(r"pip install \"[^\"]+\"")
 STYLES = {"": "default", "[data-bs-theme=dark] ": "monokai"}
@@ -61,12 +65,27 @@ def on_page_content(html: str, config: MkDocsConfig, **_: object) -> str:
 
 
 def on_post_build(config: MkDocsConfig) -> None:
-    """Write the small pictures and the colours of code."""
+    """Write the small pictures, the images of pages in `flip/` and the colours of code."""
     site = Path(config.site_dir)
     (site / "small").mkdir(exist_ok=True)
     for file in sorted(Path(config.docs_dir).glob("*.png")):
         with Image.open(file) as image:
             image.thumbnail((WIDTH, 10 * WIDTH))
             image.convert("RGBA").save(site / "small" / f"{file.stem}.webp", quality=80)
+    for page in (site / "flip").glob("*.html"):
+        page.write_text(_apart(page.read_text(encoding="utf-8"), page.with_suffix("")), encoding="utf-8")
     rules = [HtmlFormatter(style=style).get_style_defs(f"{mode}.codehilite") for mode, style in STYLES.items()]
     (site / "code.css").write_text("\n".join(rules), encoding="utf-8")
+
+
+def _apart(html: str, folder: Path) -> str:
+    """A page whose embedded images are files of a folder beside it."""
+    folder.mkdir()
+    numbers = count()
+
+    def written(found: re.Match[str]) -> str:
+        file = folder / f"{next(numbers)}.{found[1]}"
+        file.write_bytes(base64.b64decode(found[2]))
+        return f'"{folder.name}/{file.name}"'
+
+    return EMBEDDED.sub(written, html)

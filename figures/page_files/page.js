@@ -66,7 +66,7 @@ function build() {
     addPanel(images, () => ({ name: "image" + state.shot, label: current().label, value: summary(current()) }), size);
     if (state.beside !== "none") {
       const others = { image: reference.image };
-      shots.forEach((shot, k) => { others["flip" + k] = shot.flip; others["difference" + k] = shot.difference; });
+      shots.forEach((shot, k) => { others[state.beside + k] = shot[state.beside]; });
       addPanel(others, () => {
         if (state.beside === "reference") return { name: "image", label: reference.label, value: "" };
         return { ...heat(current(), state.beside), name: state.beside + state.shot };
