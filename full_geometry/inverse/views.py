@@ -192,9 +192,9 @@ def _pixels(path: Path) -> np.ndarray:
 def check_views(scene: mi.Scene, views: Sequence[GivenView], shape: mi.Shape) -> None:
     """Refuse views that do not belong to a scene.
     ValueError if a sensor does not exist, or its film is of another size or number of channels than the image; all
-    views are held out; the object is seen by none that is not; or views edit different keys, or one that is no number
-    of the scene."""
-    seen, channels = 0, len(mi.Spectrum(0))
+    views are held out; one that is not does not show the object; or views edit different keys, or one that is no
+    number of the scene."""
+    blind, channels = [], len(mi.Spectrum(0))
     for view in views:
         if isinstance(view.sensor, int) and view.sensor >= len(scene.sensors()):
             n = len(scene.sensors())
@@ -205,15 +205,16 @@ def check_views(scene: mi.Scene, views: Sequence[GivenView], shape: mi.Shape) ->
                 f"image {view.name} must be {width} x {height} of {channels} channels as sensor {view.sensor}, got "
                 f"{view.image.shape[1]} x {view.image.shape[0]} of {view.image.shape[2]}"
             )
-        seen += 0 if view.held_out else _seen(scene, view.camera(scene), shape)
+        if not view.held_out and not _seen(scene, view.camera(scene), shape):
+            blind.append(view.name)
         if view.edits.keys() != views[0].edits.keys():
             told = ", ".join(views[0].edits) or "none"
             raise ValueError(f"edits of {view.name} must be of the keys {told} as of {views[0].name}, got others")
         _edited(mi.traverse(scene), view)
     if all(view.held_out for view in views):
         raise ValueError("views must have one that is not held out, got none")
-    if seen == 0:
-        raise ValueError(f"object {shape.id()} must be seen by a view, got none of {len(views)} that shows it")
+    if blind:
+        raise ValueError(f"fitted views must show object {shape.id()}, got nothing of it in {', '.join(blind)}")
 
 
 def edit(scene: mi.Scene, view: GivenView) -> None:

@@ -89,8 +89,9 @@ def test_views_and_parameters_that_do_not_fit_are_refused_by_name(tmp_path: Path
         GivenView.of("a", 0, np.where(np.arange(192).reshape(8, 8, 3) == 7, np.nan, image))
     aside = XML.replace('target="0,0,0"', 'target="0,40,0"')
     (tmp_path / "b.xml").write_text(aside)
-    scene = open_scene(tmp_path / "b.xml")
-    refused("object ball must be seen by a view, got none of 1")
+    there, scene = scene.sensors()[0], open_scene(tmp_path / "b.xml")
+    views = [GivenView.of("b", there, image), GivenView.of("a", 0, image)]
+    refused("fitted views must show object ball, got nothing of it in a", views)
 
 
 @pytest.mark.parametrize("model", ["full_geometry", "lambert", "auto"])
