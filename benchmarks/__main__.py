@@ -5,6 +5,7 @@ from __future__ import annotations
 import figures
 from benchmarks.ablation_command import ablation_command
 from benchmarks.bench_command import bench
+from benchmarks.disturbed import disturbed_command
 from benchmarks.inversion_command import inversion_command
 from benchmarks.rivals_command import rivals_command
 from benchmarks.shapes_command import shapes_command
@@ -21,6 +22,7 @@ figures.ADDED |= {name: f"benchmarks.published.{name}" for name in ("fig03", "fi
 COMMANDS = {
     "ablation": ablation_command,
     "bench": bench,
+    "disturbed": disturbed_command,
     "gathered": gathered_command,
     "inversion": inversion_command,
     "rivals": rivals_command,

@@ -16,6 +16,7 @@ from benchmarks.__main__ import COMMANDS, app  # noqa: E402
 WRONG = {
     "ablation": ["marbel"],
     "bench": ["--only", "nope"],
+    "disturbed": ["none.xml", "--images", "none.json", "--case", "nope"],
     "figures": ["all", "marbel"],
     "gathered": ["--object", "marbel"],
     "inversion": ["--size", "0"],
