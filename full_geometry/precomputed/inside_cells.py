@@ -337,16 +337,19 @@ def _points_held(media: WalkMedia, k: int, box: tuple[np.ndarray, np.ndarray], d
             o = mi.Point3f(*(place[(a - axis) % 3] for a in range(3))) + low
             d = mi.Vector3f(*(opaque(float(a == axis)) for a in range(3)))
 
-            # ---- all that they meet inside the box
-            going = dr.full(mi.Bool, True, dr.width(i))
+            # ---- all that they meet inside the box; evaluated step by step, so that one kernel is that of all
+            going, end = dr.opaque(mi.Bool, True, dr.width(i)), opaque(box[1][axis])
             for _ in range(MOST_MET):
+                dr.eval(o)
                 si = media.instance_scene.intersect(media.inner.scene, mi.Ray3f(o, d), mi.RayFlags.Minimal, going)
-                going &= si.is_valid() & (si.p[axis] < opaque(box[1][axis]))
+                going &= si.is_valid() & (dr.dot(si.p, d) < end)
+                held = going & (media.inner.around(si) == dr.opaque(mi.Int32, k))
+                p, n_met = dr.select(held, si.p, low - opaque(np.max(size))), mi.Normal3f(si.n)
+                o = dr.select(going, si.p + d * opaque(STEP / root), o)
+                dr.eval(p, n_met, o, going)
                 if not dr.any(going):
                     break
-                p = dr.select(going & (media.inner.around(si) == k), si.p, low - opaque(np.max(size)))
-                yield EntrySample(p, mi.Normal3f(si.n), mi.Normal3f(si.n), mi.Float(1), mi.UInt32(0))
-                o = dr.select(going, si.p + d * opaque(STEP / root), o)
+                yield EntrySample(p, n_met, n_met, mi.Float(1), mi.UInt32(0))
 
 
 def _crossed_bricks(points: SurfaceParts, low: np.ndarray, h: float, counts: np.ndarray) -> np.ndarray:
