@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from figures import app as cli
 from halfspace_sss import bssrdf, materials
+from halfspace_sss.comparison import model_errors
 from halfspace_sss.maps import noisy_maps
 from halfspace_sss.maps.noisy_maps import CellGrid
 from halfspace_sss.materials import catalogue as registry
@@ -40,7 +41,8 @@ def _errors(*arguments: str) -> Any:
 
 @pytest.fixture(autouse=True)
 def _small(monkeypatch: Any, tmp_path: Path) -> None:
-    """Recipes of a second, in an empty folder, where weights are looked up too."""
+    """Recipes of a second and coarse maps, in an empty folder, where weights are looked up too."""
+    monkeypatch.setattr(model_errors, "GRID", CellGrid(16, 8))
     for name in ("STANDARD", "FAST"):
         monkeypatch.setattr(train_material, name, TINY)
     monkeypatch.setattr(train_universal, "UniversalRecipe", lambda: TINY_UNIVERSAL)
