@@ -33,7 +33,7 @@ SMALL = {  # a small run of each command, and what it refuses
     "models": ([], ["extra"]),
     "render": (["ball.xml", "--spp", "4", "--out", "o"], ["none.xml"]),
     "trade": (["ball.xml", "--model", "better_dipole", "--assess", "0.2", "--out", "o"], ["marbel"]),
-    "train material": (["--fast", "--out", "o", "--work", "o/work"], ["marbel"]),
+    "train material": (["--fast", "--steps", "20", "--out", "o", "--work", "o/work"], ["marbel"]),
     "train object": (["--scene", "ball.xml", "--out", "o"], ["--scene", "none.xml"]),
     "train shapes": (["--out", "o"], ["--mesh", "none.ply"]),
     "train universal": (["--out", "o"], ["--steps", "0"]),
@@ -41,13 +41,17 @@ SMALL = {  # a small run of each command, and what it refuses
     "view": (["ball.xml", "--port", "0"], ["none.xml"]),
 }
 HARNESS = """
-import atexit, gc, json, os, signal, subprocess, sys
+import atexit, dataclasses, gc, json, os, signal, subprocess, sys
 from pathlib import Path
 import matplotlib.pyplot, pandas, scipy.interpolate, torch, zarr  # once for all runs: each is a fork
 from halfspace_sss.cli import shared
 from figures.parts import command
 from figures import app as cli
 from figures.command_line import main
+from halfspace_sss.maps.noisy_maps import CellGrid
+from halfspace_sss.neural.training.train_material import FAST
+training = sys.modules["halfspace_sss.neural.training.train_material"]  # a function of the package has its name
+training.FAST = dataclasses.replace(FAST, n_groups=16, events=1e5, grid=CellGrid(8, 4))
 command.MOST_WORKERS = 1  # the process that is interrupted writes the files, and no other has written some by then
 gc.freeze()
 
