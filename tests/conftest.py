@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import ctypes
 import functools
 import gc
 import os
@@ -17,11 +16,15 @@ from pathlib import Path
 if "PYTEST_XDIST_WORKER" in os.environ:  # the tests run side by side: threads of each would only get in their way
     os.environ["OMP_NUM_THREADS"] = "1"
 
+if os.environ.pop("PYTHONDONTWRITEBYTECODE", ""):  # every process that a test starts would compile all modules anew
+    sys.dont_write_bytecode = False
+
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a shell starts what runs in its background
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 import numpy as np
 import pytest
+import quick_kernels
 import typer.testing
 
 import halfspace_sss
@@ -32,7 +35,6 @@ from halfspace_sss.neural import material_model, paper_model, store
 from halfspace_sss.neural.network import N_FEATURES, layer_shapes
 from halfspace_sss.neural.store import save_weights
 
-QUICKLY = Path.home() / ".drjit" / "of_tests"  # kernels that are compiled as below, apart from those of users
 # by CPU time, of fast and slow tests: begun first, so that no worker is left with one of them at the end
 LONGEST = (
     "test_every_emitter", "test_any_place_and_unit", "test_page_commands", "test_correction", "test_unscattered_light",
@@ -54,22 +56,13 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 def pytest_configure(config: pytest.Config) -> None:
     """Whole suites keep their kernels apart: they are compiled without LLVM's optional passes."""
     if config.option.markexpr in ("", "not slow", "slow"):
-        QUICKLY.mkdir(parents=True, exist_ok=True)
-        os.environ.setdefault("DRJIT_CACHE_DIR", str(QUICKLY))
+        quick_kernels.keep_apart()
 
 
 def pytest_collection_finish() -> None:
-    """Compile kernels in a quarter of the time, and look through no modules where garbage is collected.
-
-    LLVM skips its optional passes and keeps registers within blocks only. Results are the same; walks take up to 40 %
-    longer, which is less than that saves. Processes that tests start compile as those of users do.
-    """
-    path = os.environ.get("DRJIT_LIBLLVM_PATH")
-    if path and "drjit" in sys.modules and os.environ.get("DRJIT_CACHE_DIR") == str(QUICKLY):
-        options = (ctypes.c_char_p * 4)(
-            b"tests", b"-opt-bisect-limit=0", b"-opt-bisect-verbose=false", b"-regalloc=fast"
-        )
-        ctypes.CDLL(path).LLVMParseCommandLineOptions(len(options), options, None)
+    """Compile kernels in a quarter of the time, and look through no modules where garbage is collected."""
+    if "drjit" in sys.modules:
+        quick_kernels.compile_quickly()
     gc.freeze()
 
 

@@ -73,6 +73,7 @@ TEXTURE = """<texture name="albedo" type="bitmap"> <string name="filename" value
     <boolean name="raw" value="true"/> </texture>"""
 RUN = """
 import contextlib
+import dataclasses
 import io
 import json
 import os
@@ -80,10 +81,26 @@ import shlex
 import sys
 import time
 
+import quick_kernels
 from figures import fig09
 from figures.command_line import main
+from figures.parts import command as figure_command
+from full_geometry.integrators import correction
+from full_geometry.learning import training
+from halfspace_sss.comparison import model_errors
+from halfspace_sss.maps.noisy_maps import CellGrid
+from halfspace_sss.neural.training.train_material import FAST
+import halfspace_sss.neural.training.train_material
 
+quick_kernels.compile_quickly()
 fig09.SHOWN, fig09.MODELS, fig09.SIZES = {"draft": ("ketchup",)}, ("better_dipole",), {"draft": 24}
+figure_command.MOST_WORKERS = 1  # others would import and compile for themselves
+# walks of numbers that nobody reads
+training.EXITS, training.WALKS, training.SAMPLES = 16, 256, 64
+correction.PER_LAUNCH, correction.FEWEST = 2**14, 2**15
+model_errors.GRID = CellGrid(16, 8)
+train_material = sys.modules["halfspace_sss.neural.training.train_material"]  # a function of the package has its name
+train_material.FAST = train_material.STANDARD = dataclasses.replace(FAST, n_groups=16, events=1e5, grid=CellGrid(8, 4))
 
 
 def command(line):

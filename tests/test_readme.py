@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import subprocess
@@ -43,6 +44,9 @@ COMMANDS = list(
 RUN = """
 import sys
 
+import quick_kernels
+
+quick_kernels.compile_quickly()
 for number, text in enumerate(sys.argv[1:]):
     exec(compile(text, f"snippet {number}", "exec"), {"__name__": "__main__"})
     print(f"\\nend of {number}", flush=True)
@@ -52,7 +56,8 @@ for number, text in enumerate(sys.argv[1:]):
 @pytest.mark.parametrize("page", SNIPPETS)
 def test_snippets_run_and_print(page: str, tmp_path: Path) -> None:
     command = [sys.executable, "-c", RUN, *SNIPPETS[page]]  # one process: imports and kernels are shared
-    run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=env)
     assert run.returncode == 0, run.stderr
     printed = re.split(r"\nend of \d+\n", run.stdout)[:-1]
     assert len(printed) == len(SNIPPETS[page])
