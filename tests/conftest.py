@@ -37,14 +37,15 @@ from halfspace_sss.neural.store import save_weights
 
 # by CPU time, of fast and slow tests: begun first, so that no worker is left with one of them at the end
 LONGEST = (
-    "test_every_emitter", "test_any_place_and_unit", "test_page_commands", "test_correction", "test_unscattered_light",
-    "test_fig_full_geometry", "test_full_scenes", "test_edits", "test_endings", "test_full_online", "test_flame",
-    "test_rendering_gradients", "test_neural_reflectance", "test_full_training", "test_inside", "test_full_command",
-    "test_trade_scenes", "test_gathered", "test_total_error", "test_full_varying", "test_full_contents",
-    "test_full_textured", "test_translucent_walk", "test_neural_training", "test_rendering_kernels", "test_fit",
-    "test_instances", "test_walk_gradients", "test_varying_media", "test_figure_sources", "test_lit_entries",
-    "test_gradient_blocks", "test_cli_train", "test_rendering_normals", "test_wrapped", "test_readme",
-    "test_shape_model", "test_inner_light", "test_extremes", "test_low_orders", "test_model_contract", "test_fuzz",
+    "test_page_commands", "test_fit", "test_instances", "test_every_emitter", "test_any_place_and_unit",
+    "test_correction", "test_unscattered_light", "test_fig_full_geometry", "test_full_scenes", "test_edits",
+    "test_endings", "test_gallery", "test_bench", "test_full_online", "test_flame", "test_rendering_gradients",
+    "test_neural_reflectance", "test_full_training", "test_inside", "test_full_command", "test_trade_scenes",
+    "test_gathered", "test_total_error", "test_full_varying", "test_full_contents", "test_full_textured",
+    "test_translucent_walk", "test_neural_training", "test_rendering_kernels", "test_walk_gradients",
+    "test_varying_media", "test_lit_entries", "test_gradient_blocks", "test_cli_train", "test_rendering_normals",
+    "test_wrapped", "test_readme", "test_shape_model", "test_inner_light", "test_extremes", "test_low_orders",
+    "test_model_contract", "test_fuzz",
 )  # fmt: skip
 
 
