@@ -63,7 +63,7 @@ class LightRecord:
     delta: mi.Bool  # whether that direction was the only one
     straight: mi.Bool  # nothing has reflected since the last event
     connected: mi.Bool  # there was a straight edge: connections find what small emitters send along this path
-    pivot: mi.Point3f  # the event at the end of that edge
+    pivot: mi.Point3f  # the event that the last such edge began at, where they were made
     directed: mi.Bool  # directions to emitters were sampled at the last event, and nothing has reflected since
     departure: Departure  # from the last event
     sighted: mi.Bool  # an emitter was sampled at the last event, and only boundaries of index 1 were passed since
@@ -247,7 +247,7 @@ class LightVisitor:
         smooth = self.media.connects(walk.object)
         edge = record.straight & smooth & (walk.order > 0)  # this event ends one
         connected = record.connected | edge
-        record = replace(record, connected=connected, pivot=dr.select(edge, event.p, record.pivot))
+        record = replace(record, connected=connected, pivot=dr.select(edge, record.departure.p, record.pivot))
         connects, L = smooth & (walk.order + 2 <= self.media.row("most", walk.object)), record.L
         if self.outgoing is not None:
             connects &= ~record.shallow
