@@ -69,10 +69,15 @@ class LightRecord:
     sighted: mi.Bool  # an emitter was sampled at the last event, and only boundaries of index 1 were passed since
     scattered: mi.Bool  # whether a vertex has scattered into a solid angle: delta lights then are no longer hidden
     precomputed: mi.Bool  # the ray's emission is in the light of the last event, in the mirror image, or seen through
-    known: mi.Bool  # light that comes by objects alone has been found precomputed
+    known: mi.Bool  # light that comes by objects alone is in that of the last event
+    ended: mi.Bool  # and that of later events too
     slopes: Score | tuple[()] = ()  # where derivatives are asked for, see `walk.scores`
     run: ForwardRun | tuple[()] = ()  # where precomputed light has met forward events
     shallow: mi.Bool | tuple[()] = ()  # one event at most since the path went in, where deep light is told apart
+
+    def onward(self, k: mi.Int32) -> LightRecord:
+        """The record at the surface of object k, or of another surface, k < 0, whose light is not precomputed."""
+        return replace(self, known=self.known & (k >= 0), ended=self.ended & (k >= 0))
 
 
 class Seen(NamedTuple):
@@ -263,12 +268,12 @@ class LightVisitor:
 
     def _all_light(self, walk: Walk, record: LightRecord, event: Event) -> tuple[Walk, LightRecord]:
         """Precomputed light of an event: unscattered, and of a few events on all, with which the walk ends."""
-        # ---- L += throughput ∫ p L_0 dw', at the last event ∫ p (L_0 + L_s) dw'
-        last = ~record.known & (walk.order + 1 >= FEW)
+        # ---- L += throughput ∫ p (L_0 + L_u) dw', at the last event ∫ p (L_0 + L_u + L_s) dw'
+        last = ~record.ended & (walk.order + 1 >= FEW)
         light, held = self.unscattered.light(self.media, event, last)
         last &= held
-        L = record.L + dr.select(record.known, 0, walk.weight * light)
-        record = replace(record, L=L, known=record.known | last, precomputed=mi.Bool(True))
+        L, ended = record.L + dr.select(record.ended, 0, walk.weight * light), record.ended | last
+        record = replace(record, L=L, known=held | ended, ended=ended, precomputed=mi.Bool(True))
 
         # ---- a share goes on, for light by way of other surfaces
         if not self.others:
@@ -555,7 +560,8 @@ def start_record(lanes: int, scored: bool = False, forward: bool = False, splits
         directed=full(mi.Bool, False),
         departure=Departure(mi.Point3f(point), along, mi.Vector3f(along), full(mi.Int32, 0)),
         sighted=full(mi.Bool, False), scattered=full(mi.Bool, False),
-        precomputed=full(mi.Bool, False), known=full(mi.Bool, False), slopes=Score.sums(lanes) if scored else (),
+        precomputed=full(mi.Bool, False), known=full(mi.Bool, False), ended=full(mi.Bool, False),
+        slopes=Score.sums(lanes) if scored else (),
         run=ForwardRun.none(lanes) if forward else (), shallow=full(mi.Bool, False) if splits else (),
     )  # fmt: skip
 
@@ -742,7 +748,7 @@ class PathTracer:
         # ---- what masks leave: the boundary of object k or another BSDF
         walk, media, rng = p.walk, self.visitor.media, p.walk.rng
         k, bsdf, si, mute = self._drawn(p, si)
-        translucent, near, light = k >= 0, dr.maximum(k, 0), replace(p.light, known=p.light.known & (k >= 0))
+        translucent, near, light = k >= 0, dr.maximum(k, 0), p.light.onward(k)
         lit = ~(mute | light.known)
         behind, outer = None if media.inner is None else self._behind(walk, si, bsdf, translucent), translucent
         if behind is not None:

@@ -1,16 +1,17 @@
 """Light that has scattered inside objects, precomputed in the cells of unscattered light.
 
 A walk from the camera that looks up unscattered light L_0 alone goes on until it leaves: most of its noise and time lie
-in its later events. Light L_s that comes to a point by way of other events, or of other objects, is smooth there. Paths
-from the emitters bring it to the cells, once for an image, and at event FEW of a stay in an object a walk adds
+in its later events. Light L_s that comes to a point by way of other events is smooth there, and so is most light L_u
+that has not scattered, but comes by way of other objects or of the outside of the same one. Paths from the emitters
+bring both to the cells, once for an image. At event FEW of a stay in an object a walk adds
 
-    weight ∫ p(w.w') (L_0 + L_s)(x, w') dw'
+    weight ∫ p(w.w') (L_0 + L_u + L_s)(x, w') dw'
 
-and ends. Events before that one add L_0, and what they leave is met by chance, so that each path is found once: one of
-fewer than FEW events since the camera's path entered at the last of them, all others at event FEW.
+and ends. Events before that one add L_0 + L_u. So each path is found once: one of fewer than FEW events since the
+camera's path entered at the last of them, all others at event FEW.
 
 A path of light begins as rays of unscattered light do, but may also be reflected there. It walks through objects and
-between them. Each of its events adds the weight with which it arrives over sigma_s, the estimate of ∫ L_s dw dx by
+between them. Each of its events adds the weight with which it arrives over sigma_s, the estimate of ∫ L dw dx by
 collisions, but for those that L_0 holds: the first event of a path that has met nothing but the boundary of its first
 object. Light by way of other surfaces than objects and those in them is left to paths from the camera: a share of them
 goes on for that.
@@ -55,10 +56,12 @@ ONWARD = 0.25  # share of walks that go on beyond FEW events where other surface
 @dataclass
 class LightPath:
     """What a walk from an emitter carries.
-    `flux`: where it began. `direct`: whether it has met nothing but the boundary of that object since."""
+    `flux`: where it began. `direct`: whether it has met nothing but the boundary of that object since. `scattered`:
+    whether it has met events."""
 
     flux: mi.Spectrum
     direct: mi.Bool
+    scattered: mi.Bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,13 +69,14 @@ class ScatteredLight(Visitor):
     """Paths from emitters that add ∫ L_s x_j dx dw to cells at their events.
     `scene`, `media`: of Mitsuba, and its objects. `index`: of the cells of all objects. `tables`: by the number of an
     object, as of `UnscatteredLight`. `D`: of each slot and channel ∫ L_s (1, x, y, z) dx dw, x from the centre of the
-    cell by its edge."""
+    cell by its edge, then the same of L_u. `slots`: of all objects."""
 
     scene: mi.Scene
     media: WalkMedia
     index: CellIndex
     tables: dict[str, Any]
     D: mi.Float
+    slots: int
 
     def trace(self, k: int, number: int, seed: int) -> None:
         """Add the light of so many paths that begin on object k, or a few more."""
@@ -102,7 +106,7 @@ class ScatteredLight(Visitor):
         which = dr.binary_search(0, many - 1, lambda i: dr.gather(type(ends), ends, i) < at)
         o, d, off, enters, flux, size = dr.gather(tuple, (o, d, off, enters, flux, size), which)
         flux = dr.select(size > 0, flux * (opaque(total / (number * parts)) / dr.maximum(size, 1e-30)), 0)
-        return o, d, off, dr.select(enters, mi.Int32(k), OUTSIDE), size > 0, LightPath(flux, enters)
+        return o, d, off, dr.select(enters, mi.Int32(k), OUTSIDE), size > 0, LightPath(flux, enters, enters & False)
 
     def _trace(self, starts: tuple, seed: tuple[int, ...]) -> None:
         """Walk from so many starts; lanes take those of index, index + lanes, ... until none is left."""
@@ -155,16 +159,16 @@ class ScatteredLight(Visitor):
     # ---- visitor of walks
 
     def event(self, walk: Walk, path: LightPath, event: Event) -> tuple[Walk, LightPath]:
-        """Add what arrives."""
+        """Add what arrives, to L_u before the first event of a path."""
         at = dr.gather(dict, self.tables, self.media.place_of(event.object))
         x = mi.Point3f((event.p - at["low"]) * at["scale"])
         slot, y, _, held = self.index.find(x, at["first"], at["counts"], ~path.direct | (walk.order > 0))
         # refraction by the camera's paths has 1 / scale, flux has not
         light = path.flux * walk.weight * (walk.scale / dr.maximum(event.m.sigma_s, 1e-30))
-        n = len(light)
+        n, slot = len(light), mi.UInt32(slot) + dr.select(path.scattered, 0, dr.opaque(mi.UInt32, self.slots))
         for c in range(n):
-            dr.scatter_add(self.D, mi.Vector4f(1, y.x, y.y, y.z) * light[c], mi.UInt32(slot * n + c), held)
-        return walk, path
+            dr.scatter_add(self.D, mi.Vector4f(1, y.x, y.y, y.z) * light[c], slot * n + c, held)
+        return walk, replace(path, scattered=mi.Bool(True))
 
     def crossing(self, walk: Walk, path: LightPath, crossing: Crossing) -> tuple[Walk, LightPath]:
         stays = crossing.reflected(self.media, walk.d)

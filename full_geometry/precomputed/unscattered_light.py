@@ -154,35 +154,35 @@ def unscattered_light(
     dr.make_opaque(tables, index, light)
     found = UnscatteredLight(index, *light, tables, forward(media))
     if paths:
-        found = replace(found, scattered=_scattered(scene, media, seed, found, cells, paths))
+        found = _with_paths(scene, media, seed, found, cells, paths)
     dr.sync_thread()  # callers time this
     return found
 
 
-def _scattered(
+def _with_paths(
     scene: mi.Scene, media: WalkMedia, seed: int, light: UnscatteredLight, cells: list[InsideCells], paths: int
-) -> mi.Float:
-    """The fit of scattered light in the cells of all objects."""
+) -> UnscatteredLight:
+    """Light with the fit of what paths from the emitters bring to the cells of all objects, see `scattered_light`."""
     # ---- paths from all objects, which pass from one to another
-    n = 4 * len(mi.Spectrum(0))
-    D = dr.zeros(mi.Float, n * sum(grid.slots for grid in cells))
+    n, slots = 4 * len(mi.Spectrum(0)), sum(grid.slots for grid in cells)
+    D = dr.zeros(mi.Float, 2 * n * slots)
     dr.eval(D)
-    tracer = ScatteredLight(scene, media, light.index, light.tables, D)
+    tracer = ScatteredLight(scene, media, light.index, light.tables, D, slots)
     for k in np.flatnonzero(~np.array(media.enclosed(dr.arange(mi.Int32, len(cells))))).tolist():
         tracer.trace(k, max(paths // len(cells), FEWEST_PATHS), seed)
 
-    # ---- the fit of each
+    # ---- the fit of each: L_s, then L_u, which has not scattered
     parts, first = [], 0
-    for grid in cells:
+    for grid in (*cells, *cells):
         part = dr.gather(mi.Float, D, first + dr.arange(mi.UInt32, n * grid.slots))
         first += n * grid.slots
         dr.eval(part)
         grid.share(part, n, moments=True)
         grid.fit(part)
         parts.append(part)
-    result = _joined(parts)
-    dr.make_opaque(result)
-    return result
+    scattered, others = _joined(parts[: len(cells)]), light.fluence + _joined(parts[len(cells) :])
+    dr.make_opaque(scattered, others)
+    return replace(light, fluence=others, scattered=scattered)
 
 
 def _joined(parts: list) -> Any:
