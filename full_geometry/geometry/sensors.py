@@ -53,11 +53,11 @@ def seeded_sampler(sensor: mi.Sensor, spp: int, seed: int) -> mi.Sampler:
 
 
 def rays_by(
-    sensor: mi.Sensor, sampler: mi.Sampler, pixels: mi.UInt32 | None = None
+    sensor: mi.Sensor, sampler: mi.Sampler, pixels: mi.UInt32 | None = None, places: mi.Point2f | None = None
 ) -> tuple[mi.Ray3f, mi.Spectrum, mi.Vector2f]:
     """Rays of all samples of each pixel, their weights, and their positions on the film.
     `sensor`: its film has been prepared. `sampler`: with a lane for each ray, pixel by pixel. `pixels`: numbers of the
-    pixels; all where None."""
+    pixels; all where None. `places`: of the rays in their pixels, 0 to 1; those of the sampler where None."""
     spp = sampler.sample_count()
     film, size = sensor.film(), sampled_size(sensor.film())
     border = film.rfilter().border_size() if film.sample_border() else 0
@@ -69,7 +69,7 @@ def rays_by(
     first, scale, offset = (mi.Vector2i(first), mi.Vector2f(scale), mi.Vector2f(offset))
     dr.make_opaque(first, scale, offset)  # a kernel then serves all crops
     pixel = mi.Vector2i(index % width, index // width) + first
-    position = mi.Vector2f(pixel) + sampler.next_2d()
+    position = mi.Vector2f(pixel) + (sampler.next_2d() if places is None else places)
     aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
     time = sensor.shutter_open()
     if sensor.shutter_open_time() > 0:

@@ -10,12 +10,9 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
-from scipy.ndimage import uniform_filter
 
 from full_geometry.geometry.sensors import (
     checked_samples,
-    path_numbers,
     rays_by,
     sampled_size,
     seeded,
@@ -27,6 +24,7 @@ from full_geometry.geometry.shape import SceneMark
 from full_geometry.geometry.snapshot import Snapshot, same_objects
 from full_geometry.integrators.bssrdf import Launch, is_independent, undisturbed
 from full_geometry.integrators.gathering import OutgoingLight, light_state
+from full_geometry.integrators.glints import FEWEST_TRIALS, TRIALS, Glints, glint_light, glints_of
 from full_geometry.integrators.walk_paths import FirstExits, LightVisitor, PathTracer
 from full_geometry.objects.inclusions import check_sensors
 from full_geometry.objects.objects import KnowsUnit, check_size, places_of, translucent_shapes
@@ -47,18 +45,12 @@ from full_geometry.walk.media import WalkMedia
 from full_geometry.walk.random_walk import PATH_LANES, on_device
 from full_geometry.walk.scores import PathScores, with_derivatives
 from full_geometry.walk.straight_light import find_straight_light
-from halfspace_sss.arrays import aligned
 from halfspace_sss.backend import clock
 from halfspace_sss.checks import check_choice, check_flag, check_interval
 from halfspace_sss.interrupts import checkpoint, interruptible
 
 PARAMETERS = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters", "connection_share", "blur", "light", "layers")
 SAMPLES_PER_LAUNCH = 2**19
-GLINT, GLINTS, CANDIDATES = 8.0, 128, 8  # least variance over the light, one of so many pixels at most, those looked at
-PLACES, MOST_PLACES, SHARE = 32, 1024, 4  # least and most in each, for a sample; one for so many samples of the image
-NEAR = 1.5  # steps from pixel to pixel, within which what they mirror may be a rim
-FEWEST_TRIALS, TRIALS, TRIAL_RAYS = 2, 16, 4  # rays through each pixel that find them; through candidates, a pixel
-LIT_RAYS = 2**13  # that tell the light
 LAYER = ["emission.R", "emission.G", "emission.B"]
 SAMPLES_PER_RAY = 4  # of the image, for each ray of light: these take a tenth of the time or less
 SAMPLES_PER_PATH = 8  # the same for each path of scattered light, which takes as long as a few samples
@@ -109,7 +101,7 @@ def _class(variant: str) -> type:
             self._checked: tuple[Any, str] = (None, "")
             self._cells: tuple[Any, list] = (None, [])
             self._kept: tuple[Snapshot | None, UnscatteredLight | None] = (None, None)
-            self._glints: tuple[Any, mi.UInt32 | None] = (None, None)
+            self._glints: tuple[Any, Glints | None] = (None, None)
             self.filling, self.outgoing, self.ends = 0.0, None, False
 
         def media(self, scene: mi.Scene) -> WalkMedia:
@@ -213,8 +205,8 @@ def _class(variant: str) -> type:
                 _render(tracer, sensor, seed, spp, keep, False, self._glints_in(scene, tracer, sensor, spp))
                 return sensor.film().develop() if develop else None
 
-        def _glints_in(self, scene: mi.Scene, tracer: PathTracer, sensor: mi.Sensor, spp: int) -> mi.UInt32 | None:
-            """`_glints`, the same for all images of a view; None where that emission is met by chance.
+        def _glints_in(self, scene: mi.Scene, tracer: PathTracer, sensor: mi.Sensor, spp: int) -> Glints | None:
+            """`glints_of`, the same for all images of a view; None where that emission is met by chance.
 
             Only of box filters, which do not ask where in a pixel light is.
             """
@@ -223,7 +215,7 @@ def _class(variant: str) -> type:
             trial = max(FEWEST_TRIALS, min(spp // 8, TRIALS))
             state = trial, Snapshot.of(sensor), light_state(scene)
             if self._glints[0] != state:
-                self._glints = state, _glints(tracer, sensor, trial)
+                self._glints = state, glints_of(tracer, sensor, trial)
             return self._glints[1]
 
         def sample(
@@ -365,7 +357,7 @@ def _check_followed(scene: mi.Scene) -> None:
 
 def _render(
     tracer: PathTracer, sensor: mi.Sensor, seed: int, spp: int, keep: Keep | None, scored: bool = False,
-    glints: mi.UInt32 | None = None,
+    glints: Glints | None = None,
 ) -> None:  # fmt: skip
     """Fill the film of a sensor, in launches between which an interrupt is heard."""
     for obj, inside in zip(tracer.visitor.media.objects, tracer.visitor.media.specs):
@@ -381,7 +373,7 @@ def _render(
 
 def _launch(
     tracer: PathTracer, sensor: mi.Sensor, launch: Launch, seed: tuple[int, int], keep: Keep | None, scored: bool,
-    glints: mi.UInt32 | None = None,
+    glints: Glints | None = None,
 ) -> None:  # fmt: skip
     """Trace the rays of a launch and add them to the film, with derivatives if `scored`."""
     # with precomputed light places in a pixel are its noise: numbers of low discrepancy go on from launch to launch
@@ -405,9 +397,9 @@ def _launch(
     exits = FirstExits.of(tracer.visitor.scene, tracer.visitor.media, rays) if keep else None
     if glints is not None:
         apart = dr.opaque(mi.Bool, False, dr.width(rays))  # a literal would be another kernel
-        if dr.width(glints):
-            lanes = dr.arange(mi.UInt32, dr.width(glints) * spp)
-            lanes = dr.gather(mi.UInt32, glints, lanes // spp) * spp + lanes % spp
+        if dr.width(glints.pixels):
+            lanes = dr.arange(mi.UInt32, dr.width(glints.pixels) * spp)
+            lanes = dr.gather(mi.UInt32, glints.pixels, lanes // spp) * spp + lanes % spp
             dr.scatter(apart, True, lanes)
         dr.eval(apart)
         tracer = replace(tracer, apart=apart)
@@ -417,78 +409,12 @@ def _launch(
     L, emission = weight * L, weight * emission
 
     # ---- in some pixels, emission in mirrors at many more places
-    if glints is not None and dr.width(glints):
-        each = int(dr.prod(sampled_size(sensor.film()))) // (SHARE * dr.width(glints))
-        each = 2 ** (min(max(each, PLACES), MOST_PLACES).bit_length() - 1)
-        numbers = path_numbers(seeded(seed[0], 1), dr.width(glints), launch.first * each, spp * each)
-        places, weight, _ = rays_by(sensor, numbers, glints)
-        found = weight * tracer.seen_emission(tracer.shown(places))
-        found = mi.Spectrum([dr.block_sum(v, each) / each for v in found])
+    if glints is not None and dr.width(glints.pixels):
+        found = glint_light(tracer, sensor, glints, seed[0], (launch.first, spp))
         for target in (L, emission) if tracer.layers else (L,):
             dr.eval(target)
             dr.scatter_add(target, found, lanes)
     splat(sensor.film(), rays, L, seen, position, spp, list(mi.Color3f(emission)) if tracer.layers else [])
-
-
-def _glints(tracer: PathTracer, sensor: mi.Sensor, trial: int) -> mi.UInt32:
-    """Pixels in which emission seen in objects varies much more than other light.
-    `trial`: rays of each pixel that look for it."""
-    width, height = (int(v) for v in sampled_size(sensor.film()))
-    near, most = _near_mirrored(tracer, sensor), width * height // GLINTS
-    pixels = aligned(mi.UInt32, np.arange(width * height, dtype=np.uint32))
-    # of all pixels by few rays those about which it varies most, or may; of these by more rays
-    for first, wide, kept in ((True, 5, CANDIDATES * most), (False, 3, most)):
-        more = min(max(TRIAL_RAYS * width * height // max(dr.width(pixels), 1), PLACES), MOST_PLACES)
-        rays = trial if first else 2 ** (more.bit_length() - 1)
-        numbers = path_numbers(seeded(0, 3, rays), dr.width(pixels), 0, rays)
-        places, weight, _ = rays_by(sensor, numbers, pixels)
-        light = np.array(weight * tracer.seen_emission(tracer.shown(places)), dtype=float)
-        light = light.reshape(len(light), -1, rays)
-        if first:  # other light is not asked for where nothing is seen
-            least = GLINT * _other_light(tracer, sensor) if light.any() or near.any() else np.inf
-        found = np.zeros((2, len(light), height * width))
-        found[..., np.array(pixels)] = light.mean(axis=2), (light**2).mean(axis=2)
-        means, squares = uniform_filter(found.reshape(2, -1, height, width), (0, 0, wide, wide))
-        variance = (squares - means**2).sum(axis=0).ravel()
-        variance[near] += np.inf if first else 0
-        number = min(int(np.count_nonzero(variance > least)), kept)
-        pixels = aligned(mi.UInt32, np.sort(np.argsort(variance)[len(variance) - number :]))
-        if number == 0:
-            break
-    return pixels
-
-
-def _near_mirrored(tracer: PathTracer, sensor: mi.Sensor) -> np.ndarray:
-    """Whether what pixels mirror is as near to the rim of a small emitter as to what the next ones mirror."""
-    width, height = (int(v) for v in sampled_size(sensor.film()))
-    small, result = tracer.visitor.small, np.zeros(width * height, dtype=bool)
-    if small is None:
-        return result
-    rays, _, _ = rays_by(sensor, path_numbers(seeded(0, 4), width * height, 0, 1))
-    o, d, mirrors = tracer.mirrored(tracer.shown(rays))
-    for k in range(small.n_delta, len(small)):
-        k = dr.opaque(mi.UInt32, k)
-        off = np.array(dr.select(mirrors, d - small.direction(k, o)[0], dr.nan)).reshape(3, height, width)
-        step = np.full((height, width), np.nan)
-        for axis in (0, 1):
-            change = np.linalg.norm(np.diff(off, axis=axis + 1), axis=0)
-            ends = [(0, 0), (0, 0)]
-            for ends[axis] in ((0, 1), (1, 0)):
-                step = np.fmax(step, np.pad(change, ends, constant_values=np.nan))
-        rim = np.array(dr.sqrt(small.angle2(k, o)) + dr.zeros(mi.Float, width * height)).reshape(height, width)
-        result |= (np.abs(np.linalg.norm(off, axis=0) - rim) < NEAR * step).ravel()
-    return result
-
-
-def _other_light(tracer: PathTracer, sensor: mi.Sensor) -> float:
-    """The mean square of the light of objects without the emission seen in them."""
-    pixels = int(dr.prod(sampled_size(sensor.film())))
-    pixels = aligned(mi.UInt32, np.linspace(0, pixels - 1, LIT_RAYS).astype(np.uint32))
-    rays, weight, _ = rays_by(sensor, path_numbers(seeded(0, 2), LIT_RAYS, 0, 1), pixels)
-    apart = dr.opaque(mi.Bool, True, LIT_RAYS)
-    L, hit, _ = replace(tracer, apart=apart).trace(tracer.shown(rays), on_device(PATH_LANES), (0, 2))
-    light = np.array(weight * L, dtype=float)[:, np.array(hit)]
-    return float((light**2).sum() / max(light.shape[1], 1))
 
 
 def _depth(name: str, value: int) -> int:

@@ -350,14 +350,36 @@ def test_light_of_a_window_has_a_fraction_of_the_noise_of_sampled_light() -> Non
     assert noise[0] < 0.05 * noise[1]  # .06 if walks went on beyond their third event
 
 
-def test_the_mirror_image_of_a_lamp_that_fills_a_thirtieth_of_a_pixel_is_found() -> None:
-    """F L times the area of the image in a mirror of focal length R / 2, in pixels; R = 5, the lamp 29 away."""
-    scene = _scene("precomputed", MEDIUM, pixels=64, lamp=_lamp(0.2))
-    image = np.array(mi.render(scene, spp=16, seed=1)).sum(axis=2)
+@pytest.mark.parametrize(("lamp", "is_mesh"), [(0.2, False), (0.005, True)])
+def test_the_mirror_image_of_a_lamp_that_fills_a_small_part_of_a_pixel_is_found(
+    lamp: float, is_mesh: bool, tmp_path: Path
+) -> None:
+    """F L times the area of the image in a mirror of focal length R / 2, in pixels; R = 5, the lamp 29 away, F = 0.0293
+    at 31 degrees. A thirtieth of a pixel, or on a mesh a fifty thousandth."""
+    light = _lamp(lamp)
+    light["emitter"]["radiance"] *= (0.2 / lamp) ** 2
+    shape = {"type": "ply", "filename": _mesh_ball(tmp_path)} if is_mesh else None
+    image = np.array(mi.render(_scene("precomputed", MEDIUM, shape, pixels=64, lamp=light), spp=32, seed=1)).sum(axis=2)
     row, column = np.unravel_index(image.argmax(), image.shape)
     glint = image[row - 1 : row + 2, column - 1 : column + 2].sum() - 9 * np.median(image[image > 0])
     pixel = 2 * np.tan(np.radians(8)) * 38 / 64
-    assert glint == pytest.approx(3 * 20 * (0.4 / 2.4) ** 2 * (0.4 * 2.5 / (29 + 2.5) / pixel) ** 2, rel=0.15)
+    assert glint == pytest.approx(3 * 20 * 0.0293 * (0.4 * 2.5 / (29 + 2.5) / pixel) ** 2, rel=0.15)
+
+
+def _mesh_ball(folder: Path) -> str:
+    """The file of a ball of radius 5 with normals."""
+    from full_geometry.geometry.mesh import fill, set_vertex_normals
+
+    theta, phi = np.meshgrid(np.linspace(0, np.pi, 65), np.linspace(0, 2 * np.pi, 129), indexing="ij")
+    d = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1).reshape(-1, 3)
+    at = np.arange(65 * 129).reshape(65, 129)
+    a, b, c, e = (v.ravel() for v in (at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]))
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, e], axis=1)])
+    ball = mi.Mesh("ball", len(d), len(faces), has_vertex_normals=True)
+    fill(ball, 5 * d, faces)
+    set_vertex_normals(ball, d)
+    ball.write_ply(str(folder / "ball.ply"))
+    return str(folder / "ball.ply")
 
 
 def test_the_same_seed_gives_the_same_picture_and_another_seed_other_light() -> None:
