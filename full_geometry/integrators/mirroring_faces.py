@@ -15,6 +15,7 @@ from full_geometry.walk.media import WalkMedia
 TINY = 1 / 16  # pixels of a reflection that rays through pixels and their neighbours miss
 CURVED, LEVELS = 0.2, 4  # part of the spread of mirrored directions of a face that is not linear; times it is divided
 CLEAR = 1e-3  # of the way to the camera, which begins so far off a face and ends so far before the camera
+AT_ONCE = 2**16  # faces
 CAMERAS = "PerspectiveCamera", "ThinLensCamera"
 
 
@@ -29,11 +30,21 @@ def mirroring_faces(scene: mi.Scene, media: WalkMedia, small: SmallEmitters | No
         shape = media.instance_table.shapes[kind]
         if not mesh.has_faces(shape) or bool(np.array(media.row("rough", mi.Int32(k)))[0]):
             continue
-        p, n = _faces(shape, to_world(media, k))
-        a, b, c = np.moveaxis(_projected(sensor, p)[0], 1, 0)
-        area = 0.5 * np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
-        for number in range(small.n_delta, len(small)):
-            triangles = _mirroring(small, number, eye, p, n, area)
+        faces, vertices = mesh.face_vertices(shape), _vertices(shape, to_world(media, k))
+        for first in range(0, len(faces), AT_ONCE):
+            # ---- faces in the image, which may mirror
+            p, n = (v[faces[first : first + AT_ONCE]] if len(v) else v for v in vertices)
+            a, b, c = np.moveaxis(_projected(sensor, p)[0], 1, 0)
+            area = 0.5 * np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+            if len(n) == 0:
+                n = np.broadcast_to(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])[:, None], p.shape)
+            p, n, area = (v[area > 0] for v in (p, n, area))
+            triangles = [_mirroring(small, number, eye, p, n, area) for number in range(small.n_delta, len(small))]
+            triangles = np.concatenate([p[:0], *triangles])
+            if len(triangles) == 0:
+                continue
+
+            # ---- their triangles that nothing is before
             place, way = _projected(sensor, triangles)
             o = of_rows(mi.Point3f, triangles.reshape(-1, 3)) + CLEAR * way
             hidden = np.array(scene.ray_test(mi.Ray3f(o, way, 1 - 2 * CLEAR, 0.0, []))).reshape(-1, 3).any(axis=1)
@@ -54,14 +65,16 @@ def _mirroring(
     small: SmallEmitters, number: int, eye: np.ndarray, p: np.ndarray, n: np.ndarray, area: np.ndarray
 ) -> np.ndarray:
     """Corners of triangles on faces that mirror an emitter towards the camera in less than TINY pixels, (n, 3, 3).
-    `p`, `n`: corners and normals of the faces, from `_faces`. `area`: that they have in the image, pixels.
+    `p`, `n`: corners of the faces and their normals, (faces, 3, 3). `area`: that they have in the image, pixels.
 
     A point x with the normal n mirrors the direction r = d - 2 (d.n) n, d from the camera. It misses the direction w to
     the emitter by e = r - (r.w) w, and mirrors this where that is shorter than its radius. Between the corners of a
     face e is linear but for a part of its spread. Faces with the rim of an emitter are divided into four.
     """
-    k, found = dr.opaque(mi.UInt32, number), []
+    k, found = dr.opaque(mi.UInt32, number), [p[:0]]
     for level in range(LEVELS + 1):
+        if len(p) == 0:
+            break
         # ---- e of the corners, and the radius
         d = p - eye
         d /= np.linalg.norm(d, axis=-1, keepdims=True)
@@ -73,18 +86,19 @@ def _mirroring(
         cosine = (r * w).sum(axis=-1, keepdims=True)
         e = r - cosine * w
 
-        # ---- the faces where it is shorter
-        b, size = _nearest(e), np.linalg.norm(e, axis=-1).max(axis=1)
+        # ---- the faces where it is shorter: none whose first corner is farther off than e spreads
         spread = np.linalg.norm(e - np.roll(e, 1, axis=1), axis=-1).max(axis=1)
-        meets = (np.linalg.norm(np.einsum("fi,fix->fx", b, e), axis=1) < radius + CURVED * spread) & (
-            cosine.max(axis=(1, 2)) > 0
-        )
+        near = np.linalg.norm(e[:, 0], axis=-1) < radius + (1 + CURVED) * spread
+        near &= cosine.max(axis=(1, 2)) > 0
+        p, n, e, radius, spread, area = (v[near] for v in (p, n, e, radius, spread, area))
+        b, size = _nearest(e), np.linalg.norm(e, axis=-1).max(axis=1)
+        meets = np.linalg.norm(np.einsum("fi,fix->fx", b, e), axis=1) < radius + CURVED * spread
         if level == 0:  # of the face it takes the share of pi radius² in the area of e
             of_e = 0.5 * np.linalg.norm(np.cross(e[:, 1] - e[:, 0], e[:, 2] - e[:, 0]), axis=1)
             meets &= area * np.minimum(np.pi * radius**2 / np.maximum(of_e, 1e-30), 1) < TINY
         whole = (size < radius) | (level == LEVELS)
         found.append(p[meets & whole])
-        p, n = (_quarters(v[meets & ~whole]) for v in (p, n))
+        p, n, area = *(_quarters(v[meets & ~whole]) for v in (p, n)), np.repeat(area[meets & ~whole], 4)
     return np.concatenate(found)
 
 
@@ -95,13 +109,12 @@ def _quarters(x: np.ndarray) -> np.ndarray:
     return np.concatenate([np.stack(part, axis=1) for part in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
 
 
-def _faces(shape: mi.Shape, to_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of the faces of a mesh in the world, (faces, 3, 3), and the normals that it shows there."""
-    p = np.stack(mesh.face_corners(shape), axis=1) @ to_world[:3, :3].T + to_world[:3, 3]
-    n = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])[:, None]
+def _vertices(shape: mi.Shape, to_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices of a mesh in the world, (n, 3), and their normals there, (0, 3) where faces show their own."""
+    p, n = mesh.vertex_positions(shape), np.empty((0, 3), dtype=np.float32)
     if shape.has_vertex_normals():
-        n = mesh.vertex_normals(shape)[mesh.face_vertices(shape)] @ np.linalg.inv(to_world[:3, :3])
-    return p, np.broadcast_to(n, p.shape)
+        n = mesh.vertex_normals(shape) @ np.linalg.inv(to_world[:3, :3])
+    return p @ to_world[:3, :3].T + to_world[:3, 3], n
 
 
 def _nearest(x: np.ndarray) -> np.ndarray:
