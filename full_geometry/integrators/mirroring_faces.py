@@ -13,7 +13,7 @@ from full_geometry.precomputed.lit_points import to_world
 from full_geometry.walk.media import WalkMedia
 
 TINY = 1 / 16  # pixels of a reflection that rays through pixels and their neighbours miss
-CURVED, LEVELS = 0.2, 4  # part of the spread of mirrored directions of a face that is not linear; times it is divided
+CURVED, LEVELS = 0.2, 9  # part of the spread of mirrored directions of a face that is not linear; times it is divided
 CLEAR = 1e-3  # of the way to the camera, which begins so far off a face and ends so far before the camera
 AT_ONCE = 2**16  # faces
 CAMERAS = "PerspectiveCamera", "ThinLensCamera"
@@ -69,7 +69,8 @@ def _mirroring(
 
     A point x with the normal n mirrors the direction r = d - 2 (d.n) n, d from the camera. It misses the direction w to
     the emitter by e = r - (r.w) w, and mirrors this where that is shorter than its radius. Between the corners of a
-    face e is linear but for a part of its spread. Faces with the rim of an emitter are divided into four.
+    face e is linear but for a part of its spread. Faces with the rim of an emitter are divided into four until their
+    spread is below the radius.
     """
     k, found = dr.opaque(mi.UInt32, number), [p[:0]]
     for level in range(LEVELS + 1):
@@ -87,16 +88,16 @@ def _mirroring(
         e = r - cosine * w
 
         # ---- the faces where it is shorter: none whose first corner is farther off than e spreads
-        spread = np.linalg.norm(e - np.roll(e, 1, axis=1), axis=-1).max(axis=1)
-        near = np.linalg.norm(e[:, 0], axis=-1) < radius + (1 + CURVED) * spread
+        spread, curved = np.linalg.norm(e - np.roll(e, 1, axis=1), axis=-1).max(axis=1), CURVED / 2**level
+        near = np.linalg.norm(e[:, 0], axis=-1) < radius + (1 + curved) * spread
         near &= cosine.max(axis=(1, 2)) > 0
         p, n, e, radius, spread, area = (v[near] for v in (p, n, e, radius, spread, area))
         b, size = _nearest(e), np.linalg.norm(e, axis=-1).max(axis=1)
-        meets = np.linalg.norm(np.einsum("fi,fix->fx", b, e), axis=1) < radius + CURVED * spread
+        meets = np.linalg.norm(np.einsum("fi,fix->fx", b, e), axis=1) < radius + curved * spread
         if level == 0:  # of the face it takes the share of pi radius² in the area of e
             of_e = 0.5 * np.linalg.norm(np.cross(e[:, 1] - e[:, 0], e[:, 2] - e[:, 0]), axis=1)
             meets &= area * np.minimum(np.pi * radius**2 / np.maximum(of_e, 1e-30), 1) < TINY
-        whole = (size < radius) | (level == LEVELS)
+        whole = (np.minimum(size, spread) < radius) | (level == LEVELS)
         found.append(p[meets & whole])
         p, n, area = *(_quarters(v[meets & ~whole]) for v in (p, n)), np.repeat(area[meets & ~whole], 4)
     return np.concatenate(found)
