@@ -56,7 +56,7 @@ def glint_light(
     for half, (a, b) in enumerate((whole, (low, high))):
         # ---- places uniform in the pixel, or in its rectangle
         numbers = path_numbers(seeded(seed, 1 + half), number, first * each, spp * each)
-        x = dr.lerp(a, b, numbers.next_2d())
+        x = dr.clip(dr.lerp(a, b, numbers.next_2d()), a, b)  # rounding puts none beside its rectangle, where q is small
         rays, weight, _ = rays_by(sensor, numbers, glints.pixels, x)
         q = 0.5 + dr.select(dr.all((x >= low) & (x <= high)), 0.5 / area, 0)
         found = weight * tracer.seen_emission(tracer.shown(rays)) / q
