@@ -91,15 +91,15 @@ def _mirroring(
         spread, curved = np.linalg.norm(e - np.roll(e, 1, axis=1), axis=-1).max(axis=1), CURVED / 2**level
         near = np.linalg.norm(e[:, 0], axis=-1) < radius + (1 + curved) * spread
         near &= cosine.max(axis=(1, 2)) > 0
-        p, n, e, radius, spread, area = (v[near] for v in (p, n, e, radius, spread, area))
+        p, n, e, radius, spread = (v[near] for v in (p, n, e, radius, spread))
         b, size = _nearest(e), np.linalg.norm(e, axis=-1).max(axis=1)
         meets = np.linalg.norm(np.einsum("fi,fix->fx", b, e), axis=1) < radius + curved * spread
         if level == 0:  # of the face it takes the share of pi radius² in the area of e
             of_e = 0.5 * np.linalg.norm(np.cross(e[:, 1] - e[:, 0], e[:, 2] - e[:, 0]), axis=1)
-            meets &= area * np.minimum(np.pi * radius**2 / np.maximum(of_e, 1e-30), 1) < TINY
+            meets &= area[near] * np.minimum(np.pi * radius**2 / np.maximum(of_e, 1e-30), 1) < TINY
         whole = (np.minimum(size, spread) < radius) | (level == LEVELS)
         found.append(p[meets & whole])
-        p, n, area = *(_quarters(v[meets & ~whole]) for v in (p, n)), np.repeat(area[meets & ~whole], 4)
+        p, n = (_quarters(v[meets & ~whole]) for v in (p, n))
     return np.concatenate(found)
 
 

@@ -162,7 +162,7 @@ class ScatteredLight(Visitor):
         """Add what arrives, to L_u before the first event of a path."""
         at = dr.gather(dict, self.tables, self.media.place_of(event.object))
         x = mi.Point3f((event.p - at["low"]) * at["scale"])
-        slot, y, _, held = self.index.find(x, at["first"], at["counts"], ~path.direct | (walk.order > 0))
+        slot, y, _, held = self.index.find(x, at["first"], at["counts"], ~path.direct | path.scattered)
         # refraction by the camera's paths has 1 / scale, flux has not
         light = path.flux * walk.weight * (walk.scale / dr.maximum(event.m.sigma_s, 1e-30))
         n, slot = len(light), mi.UInt32(slot) + dr.select(path.scattered, 0, dr.opaque(mi.UInt32, self.slots))
