@@ -83,7 +83,7 @@ def error_table(
     models = {BACKBONE: transport_of(obj, BACKBONE), "full_geometry": learnt.model}
     models["S = alpha p"] = fit_alpha_p(obj, FlowRecipe(seconds=seconds), seed)
     for key, model in models.items():
-        errors = model_errors.measure(obj, model, proposals, truth=truth, samples=samples, seed=seed)
+        errors = compare(model_errors.modelled(model, proposals, truth.exits, samples, seed), truth.truth)
         rows += [{"model": key, **row._asdict()} for row in errors]
     tell("full_geometry_paper", 2)
     net, _ = fit_paper(obj, PaperRecipe(n=n, seconds=seconds), seed)

@@ -13,8 +13,9 @@ model knows of uniform light, where that is trusted, and no S: the error of that
 
 from __future__ import annotations
 
+import itertools
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -145,22 +146,16 @@ class RadianceError(NamedTuple):
     ratio: float
 
 
-def compare(model: ExitRadiance, truth: ExitRadiance) -> list[RadianceError]:
-    """The errors of all channels under both kinds of light."""
-    kinds = tuple(zip(LIGHTS, (slice(0, 1), slice(1, None))))
-    return [_error(c, light, columns, model, truth) for c in range(len(truth.mean)) for light, columns in kinds]
-
-
-def of_uniform_light(model: ExitRadiance, truth: ExitRadiance) -> list[RadianceError]:
-    """The errors of all channels under an even sky, the first of the lights of both."""
-    return [_error(c, EVEN_SKY, slice(0, 1), model, truth) for c in range(len(truth.mean))]
-
-
-def _error(c: int, light: str, columns: slice, model: ExitRadiance, truth: ExitRadiance) -> RadianceError:
-    a, b = model.mean[c][:, columns], truth.mean[c][:, columns]
-    square = (a - b) ** 2 - model.variance[c][:, columns] - truth.variance[c][:, columns]
-    off = _jackknife(square, b)
-    return RadianceError(c, light, off.value, off.standard_error, float(a.mean() / max(b.mean(), 1e-300)))
+def compare(model: ExitRadiance, truth: ExitRadiance, lights: Sequence[str] = LIGHTS) -> list[RadianceError]:
+    """The errors of all channels under kinds of light; an even sky is the first of the lights of both, as constant."""
+    rows = []
+    for c, light in itertools.product(range(len(truth.mean)), lights):
+        columns = slice(1, None) if light == "lobes" else slice(0, 1)
+        a, b = model.mean[c][:, columns], truth.mean[c][:, columns]
+        square = (a - b) ** 2 - model.variance[c][:, columns] - truth.variance[c][:, columns]
+        off = _jackknife(square, b)
+        rows.append(RadianceError(c, light, off.value, off.standard_error, float(a.mean() / max(b.mean(), 1e-300))))
+    return rows
 
 
 def _jackknife(square: np.ndarray, truth: np.ndarray) -> NoiseFree:
@@ -175,23 +170,6 @@ def _jackknife(square: np.ndarray, truth: np.ndarray) -> NoiseFree:
     return NoiseFree(whole, float(np.sqrt((n - 1) * np.mean((parts - parts.mean()) ** 2))))
 
 
-def measure(
-    obj: TranslucentObject,
-    transport: Transport,
-    proposals: EntryProposals,
-    *,
-    truth: ExitTruth | None = None,
-    samples: int = 8192,
-    seed: int = 0,
-) -> list[RadianceError]:
-    """The error of a transport of an object, per channel, under constant light and lobes.
-    `transport`: its S. `proposals`: where entries are drawn. `truth`: from `reference`, of the orders of the transport;
-    made anew by default. `samples`: entries of each exit."""
-    check_count("samples", samples, 2)
-    truth = truth or reference(obj, seed=seed, fewest=FEWEST[transport.orders])
-    return compare(modelled(transport, proposals, truth.exits, samples, seed), truth.truth)
-
-
 def _even_sky(transport: Transport, by_S: ExitRadiance, truth: ExitTruth) -> list[RadianceError]:
     """The errors of images under an even sky: those of alpha where it is trusted, elsewhere of S."""
     alpha, n = transport.alpha, len(by_S.mean)
@@ -199,7 +177,7 @@ def _even_sky(transport: Transport, by_S: ExitRadiance, truth: ExitTruth) -> lis
         return []
     known = np.array(alpha.known[1]).reshape(n, 1, 1) > 0
     mean = np.where(known, np.array(alpha(truth.exits)[1]).reshape(n, -1, 1), by_S.mean[..., :1])
-    return of_uniform_light(ExitRadiance(mean, np.where(known, 0, by_S.variance[..., :1])), truth.truth)
+    return compare(ExitRadiance(mean, np.where(known, 0, by_S.variance[..., :1])), truth.truth, [EVEN_SKY])
 
 
 def errors_of(

@@ -22,8 +22,8 @@ from full_geometry.learning.model_errors import (
     ExitRadiance,
     ExitTruth,
     RadianceError,
-    measure,
-    of_uniform_light,
+    compare,
+    modelled,
     reference,
     traced,
 )
@@ -80,7 +80,7 @@ def trusted(
 def _error(alpha: np.ndarray, truth: ExitRadiance) -> np.ndarray:
     """Relative RMSE of shares (channels, exits) under constant light, without the noise of walks."""
     shares = alpha[:, :, None].astype(float)
-    return np.array([row.error for row in of_uniform_light(ExitRadiance(shares, np.zeros_like(shares)), truth)])
+    return np.array([row.error for row in compare(ExitRadiance(shares, np.zeros_like(shares)), truth, ["constant"])])
 
 
 # ---- Exits that the camera sees, beside random ones: its walks are data for the fit as they come ---
@@ -442,7 +442,7 @@ class _ObjectTraining:
         """The errors of the model as it stands; entries follow the patches, which have less noise than probes."""
         model, sampler = self.learnt()
         by = self.proposals.with_patches(sampler)
-        return measure(self.object, model, by, truth=truth, samples=samples, seed=self.seed)
+        return compare(modelled(model, by, truth.exits, samples, self.seed), truth.truth)
 
     def _judged(self, truth: ExitTruth, samples: int) -> list[RadianceError]:
         """Errors at the end, and where the directional albedo may be used."""

@@ -18,7 +18,7 @@ pytest.importorskip("torch")
 
 import full_geometry  # noqa: E402
 from full_geometry.geometry.points import SurfacePoint  # noqa: E402
-from full_geometry.learning.model_errors import LIGHTS, measure, transport_of  # noqa: E402
+from full_geometry.learning.model_errors import LIGHTS, compare, modelled, reference, transport_of  # noqa: E402
 from full_geometry.learning.network_fitting import Recipe  # noqa: E402
 from full_geometry.learning.training import Trained, train  # noqa: E402
 from full_geometry.objects.objects import TranslucentObject, object_of  # noqa: E402
@@ -104,7 +104,8 @@ def test_a_grid_of_one_value_gives_the_first_event_of_the_homogeneous_medium() -
 def test_training_halves_the_error_of_the_half_space_in_a_medium_that_varies(trained: Trained) -> None:
     obj = trained.model.object
     proposals = EntryProposals(obj, HalfSpace(obj, "better_dipole"))
-    plane = measure(obj, transport_of(obj, "better_dipole"), proposals, samples=1024)
+    truth = reference(obj)
+    plane = compare(modelled(transport_of(obj, "better_dipole"), proposals, truth.exits, 1024), truth.truth)
     assert np.all(constant(trained.errors) < 0.5 * constant(plane))
 
 
