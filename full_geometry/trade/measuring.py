@@ -32,8 +32,6 @@ from full_geometry.trade.statistics import (
     joined,
     mean_square,
     mean_square_of,
-    mean_square_of_parts,
-    mean_square_to_parts,
     noise_of_parts,
     ratio_of_means,
     relative_variance,
@@ -258,13 +256,12 @@ def _row(
     # Estimate bias² against walks; of gathered light by two parts, whose noise more samples do not take away.
     bias2, doubt = Number(0.0, 0.0), Number(0.0, 0.0)
     if not technique.exact:
-        several = len(parts) > 1
-        kept = _kept(on, k, technique) if several else 0.0
-        bias2 = mean_square_of_parts(parts, walked.estimate, kept) if several else mean_square(cost, walked.estimate)
+        kept = _kept(on, k, technique) if len(parts) > 1 else 0.0
+        bias2 = mean_square(parts, [walked.estimate], kept)
         if technique.light == PRECOMPUTED:
             bias2 = _of_precomputed(walked, known)
         elif len(known) > 1:
-            own, precisely = _of_precomputed(walked, known), mean_square_to_parts(parts, known, kept)
+            own, precisely = _of_precomputed(walked, known), mean_square(parts, known, kept)
             precisely = Number(precisely.value, math.hypot(precisely.error, max(own.value, 0.0) + own.error))
             bias2 = min(bias2, precisely, key=lambda each: each.error)
     if walked.blur:
@@ -291,14 +288,14 @@ def light_variance(on: Stage, parts: Sequence[RadianceEstimate]) -> Number:
     `parts`: walks by two independent ones; of one light that is sampled it is 0."""
     if len(parts) < 2:
         return Number(0.0, 0.0)
-    noise = noise_of_parts(tuple(parts), joined(parts))
+    noise = noise_of_parts(parts, joined(parts))
     return with_prior(Number(on.lit * noise.value, on.lit * noise.error), KNOWN_LIGHT)
 
 
 def _of_precomputed(walked: Sampled, parts: list[RadianceEstimate]) -> Number:
     """The bias² of walks with precomputed light, as far as walks by chance can tell."""
     noise = relative_variance(walked.estimate, joined(parts)).value / max(walked.estimate.samples, 1)
-    found = mean_square_of_parts(parts, walked.estimate, 0.0)
+    found = mean_square(parts, [walked.estimate])
     return with_prior(found, KNOWN_BIAS2) if noise < TELLING else Number(0.0, KNOWN_BIAS2)
 
 

@@ -5,12 +5,8 @@ With estimates a of a way and b of walks at n exits and C channels, and their va
     bias² = Σ_k,c [(a - b)² - var a - var b] / (n C),  over (mean b)²,
 
 whose mean over all samples is the true one. Gathered light has noise of its own, which more samples do not take away:
-from two independent parts a_1 and a_2
-
-    bias² = Σ_k,c [(a_1 - b)(a_2 - b) - var b + kept (a_1 - a_2)² / 2] / (n C),  over (mean b)²,
-
-where `kept` is the share of the variance of a part that gathering with all samples has. Standard errors are those of
-the jackknife over exits.
+two independent parts tell it (`mean_square`), with `kept` the share of the variance of a part that gathering with all
+samples has. Standard errors are those of the jackknife over exits.
 
 The brightest of 10⁴ samples are fireflies, such as lamps that are mirrored after a walk: one of them may carry a
 hundredth of all light. Variances of a sample are without them, as no assessment can tell their share, and images are
@@ -137,11 +133,30 @@ class SteadyMean(NamedTuple):
         return self.variance + self.shared[:, None] * self.mean**2
 
 
-def mean_square(a: RadianceEstimate, b: RadianceEstimate) -> Number:
-    """Mean squared difference over the square of the mean radiance of b; may come out below 0 in noise."""
-    one, walks = a.steady, b.steady
-    square = ((one.mean - walks.mean) ** 2 - one.noise - walks.noise).mean(axis=0)
-    return _with_shared(_ratio(square, walks.mean.mean(axis=0), 2), one, walks)
+def mean_square(parts: Sequence[RadianceEstimate], walks: Sequence[RadianceEstimate], kept: float = 0.0) -> Number:
+    """Mean squared difference of one or two independent parts a from one or two independent parts b of walks,
+
+        bias² = Σ_k,c [(a_1 - b_1)(a_2 - b_2) + (a_1 - b_2)(a_2 - b_1) + kept (a_1 - a_2)²] / (2 n C),
+
+    over the square of the mean radiance of b. Products of independent parts have no noise: the variance of what is one
+    part alone is taken off, and that of a_1 and a_2 off the last square. It may come out below 0.
+    """
+    found, known = [each.steady for each in parts], [each.steady for each in walks]
+    (one, two), (b, c) = ((of[0], of[-1]) for of in (found, known))
+    square = 0.5 * ((one.mean - b.mean) * (two.mean - c.mean) + (one.mean - c.mean) * (two.mean - b.mean))
+    if len(parts) == 1:
+        square -= one.noise
+    if len(walks) == 1:
+        square -= b.noise
+    if len(parts) == 2:
+        square += kept * _variance_between(one, two)
+    mean = 0.5 * (b.mean + c.mean).mean(axis=0)
+    return _with_shared(_ratio(square.mean(axis=0), mean, 2), *([] if len(parts) > len(walks) else [one]), *known)
+
+
+def _variance_between(one: SteadyMean, two: SteadyMean) -> np.ndarray:
+    """Variance of what two parts are made of beside their samples."""
+    return 0.5 * ((one.mean - two.mean) ** 2 - one.noise - two.noise)
 
 
 def _with_shared(found: Number, *noisy: SteadyMean) -> Number:
@@ -156,38 +171,10 @@ def mean_square_of(difference: RadianceEstimate, b: RadianceEstimate) -> Number:
     return _ratio(square, b.mean.mean(axis=0), 2)
 
 
-def mean_square_of_parts(parts: tuple[RadianceEstimate, RadianceEstimate], b: RadianceEstimate, kept: float) -> Number:
-    """Mean squared difference of two independent parts over the square of the mean radiance of b."""
-    one, two, walks = *(part.steady for part in parts), b.steady
-    left = (one.mean - walks.mean) * (two.mean - walks.mean) - walks.noise
-    noise = 0.5 * ((one.mean - two.mean) ** 2 - one.noise - two.noise)
-    return _with_shared(_ratio((left + kept * noise).mean(axis=0), walks.mean.mean(axis=0), 2), walks)
-
-
-def mean_square_to_parts(
-    parts: Sequence[RadianceEstimate], walks: Sequence[RadianceEstimate], kept: float
-) -> Number:  # fmt: skip
-    """Mean squared difference from two independent parts b of walks, whose noise no product has:
-
-        bias² = Σ_k,c [(a_1 - b_1)(a_2 - b_2) + (a_1 - b_2)(a_2 - b_1) + kept (a_1 - a_2)²] / (2 n C)
-
-    with var a_1 + var a_2 taken off the last square, or Σ_k,c [(a - b_1)(a - b_2) - var a] / (n C) of a single a, over
-    the square of the mean radiance of b.
-    """
-    (one, two), (b, c) = (parts[0].steady, parts[-1].steady), (each.steady for each in walks)
-    square = 0.5 * ((one.mean - b.mean) * (two.mean - c.mean) + (one.mean - c.mean) * (two.mean - b.mean))
-    if len(parts) == 1:
-        square -= one.noise
-    square += 0.5 * kept * ((one.mean - two.mean) ** 2 - one.noise - two.noise) if len(parts) > 1 else 0.0
-    mean = 0.5 * (b.mean + c.mean).mean(axis=0)
-    return _with_shared(_ratio(square.mean(axis=0), mean, 2), one, b, c)
-
-
-def noise_of_parts(parts: tuple[RadianceEstimate, RadianceEstimate], b: RadianceEstimate) -> Number:
+def noise_of_parts(parts: Sequence[RadianceEstimate], b: RadianceEstimate) -> Number:
     """Variance of what two parts are made of beside their samples, over the square of the mean radiance of b."""
     one, two = (part.steady for part in parts)
-    square = 0.5 * ((one.mean - two.mean) ** 2 - one.noise - two.noise)
-    found = _with_shared(_ratio(square.mean(axis=0), b.mean.mean(axis=0), 2), one, two)
+    found = _with_shared(_ratio(_variance_between(one, two).mean(axis=0), b.mean.mean(axis=0), 2), one, two)
     return Number(max(found.value, 0.0), found.error)
 
 

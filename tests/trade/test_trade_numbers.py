@@ -21,8 +21,6 @@ from full_geometry.trade.statistics import (
     Number,
     RadianceEstimate,
     mean_square,
-    mean_square_of_parts,
-    mean_square_to_parts,
     noise_of_parts,
     relative_variance,
     with_prior,
@@ -43,7 +41,7 @@ def _squares(off: float, sd: float) -> np.ndarray:
     rng, found = np.random.default_rng(3), []
     for _ in range(SEEDS):
         truth = 1 + 0.3 * rng.standard_normal((3, EXITS))
-        found.append(mean_square(_estimate(rng, truth * (1 + off), sd), _estimate(rng, truth, 2 * sd)))
+        found.append(mean_square([_estimate(rng, truth * (1 + off), sd)], [_estimate(rng, truth, 2 * sd)]))
     return np.array(found)
 
 
@@ -89,7 +87,7 @@ def test_fireflies_of_walks_put_neither_bias_nor_noise_into_a_square() -> None:
         walks.add(values.sum(-1), (values**2).sum(-1), n)
         walks.add_bright(values.reshape(1, -1), n)
         model = _estimate(rng, np.ones((1, EXITS)), 0.02)
-        found.append(mean_square(model, walks))
+        found.append(mean_square([model], [walks]))
         naive.append(((model.mean - walks.mean) ** 2 - model.variance - walks.variance).mean())
     values, errors = np.array(found).T
     assert abs(values.mean()) < 4 * values.std() / math.sqrt(len(values))  # 4 standard errors
@@ -360,8 +358,8 @@ def test_a_bias_is_told_by_two_parts_of_walks_without_their_noise() -> None:
         light = [truth * (1 + own * rng.standard_normal(truth.shape)) for _ in range(2)]  # of precomputed light
         walks = [_estimate(rng, each, 0.5) for each in light]
         parts = [_estimate(rng, truth * (1 + off) + own * rng.standard_normal(truth.shape), 0.1) for _ in range(2)]
-        found.append(mean_square_to_parts(parts, walks, kept))
-        single.append(mean_square_to_parts([_estimate(rng, truth * (1 + off), 0.5)], walks, 0.0))
+        found.append(mean_square(parts, walks, kept))
+        single.append(mean_square([_estimate(rng, truth * (1 + off), 0.5)], walks))
     for numbers, expected in ((found, off**2 * (1 + 0.3**2) + kept * own**2), (single, off**2 * (1 + 0.3**2))):
         values, errors = np.array(numbers).T
         assert abs(values.mean() - expected) < 4 * values.std() / math.sqrt(SEEDS)  # 4 standard errors
@@ -375,7 +373,7 @@ def test_the_noise_of_precomputed_light_is_told_by_two_parts_and_is_no_bias() ->
     noise = noise_of_parts((one, two), walks)
     assert noise.error < 0.1 * noise.value
     assert noise.value == pytest.approx(off**2 * np.mean(L**2) / np.mean(L) ** 2, abs=4 * noise.error)
-    bias2 = mean_square_of_parts((one, two), walks, 0.0)
+    bias2 = mean_square((one, two), [walks])
     assert abs(bias2.value) < 4 * bias2.error < 0.2 * noise.value
 
 
@@ -432,7 +430,7 @@ def test_of_the_noise_of_gathered_light_what_a_render_keeps_counts_as_bias() -> 
     for _ in range(SEEDS):
         truth = np.ones((3, EXITS))
         parts = [_estimate(rng, 1 + off + own * rng.standard_normal((3, EXITS)), 0.1) for _ in range(2)]
-        found.append(mean_square_of_parts(tuple(parts), _estimate(rng, truth, 0.5), kept))
+        found.append(mean_square(parts, [_estimate(rng, truth, 0.5)], kept))
     values, errors = np.array(found).T
     expected = off**2 + kept * own**2
     assert abs(values.mean() - expected) < 4 * values.std() / math.sqrt(SEEDS)  # 4 standard errors
