@@ -29,7 +29,7 @@ import numpy as np
 from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.settings import GATHERED_LIGHTS
 from full_geometry.trade.assessing import assess
-from full_geometry.trade.results import UNNAMED, Assessment, ObjectTrade, TechniqueTrade, html_table, plain, samples_for
+from full_geometry.trade.results import UNNAMED, Assessment, ObjectTrade, TechniqueTrade, html_table, plain
 from full_geometry.trade.techniques import CORRECTED, LAMBERT, WALKED, Job, Technique
 from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.comparison.curve_set import TRACED
@@ -193,12 +193,8 @@ _Raw = tuple[float, float, float, TechniqueTrade]  # seconds, samples of a pixel
 
 
 def _option(assessed: ObjectTrade, row: TechniqueTrade, job: Job) -> _Raw:
-    needed = samples_for(row, job.tolerance)
-    if not needed < math.inf:
-        return math.inf, 0.0, row.bias, row
-    spp = max(math.ceil(needed), 1)
-    took = row.job_seconds(job.images, assessed.pixels * spp)
-    return took, spp, math.hypot(row.bias, math.sqrt(row.noise2(spp))), row
+    took, spp = assessed.job(row, job.tolerance, job.images)
+    return took, spp, math.hypot(row.bias, math.sqrt(row.noise2(spp))) if spp else row.bias, row
 
 
 def _in_time(assessed: ObjectTrade, row: TechniqueTrade, job: Job) -> _Raw:
@@ -213,18 +209,18 @@ def _in_time(assessed: ObjectTrade, row: TechniqueTrade, job: Job) -> _Raw:
 
 def _told(assessed: ObjectTrade, option: _Raw, best: _Raw, job: Job) -> Option:
     took, spp, error, row = option
-    off = _off(row)
+    off, training = _off(row), f", its training of {_time(row.training)} counted" if row.training else ""
     if option is best:
         size = f"{assessed.mfp[0]:.3g} to {assessed.mfp[1]:.3g} mean free paths across"
         images = "an image" if job.images == 1 else f"{job.images} images"
         why = f"{row.way} is the cheapest that keeps {job.tolerance:.3g} ({size}): {off}, {images} in {_time(took)}"
-        why += f" with {int(spp)} {'sample' if spp == 1 else 'samples'} a pixel" + _training(row)
+        why += f" with {int(spp)} {'sample' if spp == 1 else 'samples'} a pixel" + training
         why += f"; render {Technique.of(row.way).flags} --spp {int(spp)}"
     elif took < math.inf:
         over = job.seconds is not None and took > job.seconds
         why = f"{row.way} takes {_time(took)}"
         why += f", allowed {_time(job.seconds)}" if over else f", {short(took / best[0])} times as long" + f" ({off})"
-        why += _training(row)
+        why += training
     elif row.bias2 - 2 * row.bias2_error < job.tolerance**2:
         why = f"{row.way} is {off}: whether it keeps {job.tolerance:.3g} cannot be measured with so few samples"
     else:
@@ -244,12 +240,6 @@ def _nearest(option: _Raw, best: _Raw, job: Job) -> Option:
     else:
         why = f"{row.way} has no time for an image in {_time(took)}"
     return Option(row.way, took, int(spp), error, why)
-
-
-def _training(row: TechniqueTrade) -> str:
-    if not row.training:
-        return ""
-    return f", its training of {_time(row.training)} counted"
 
 
 def _off(row: TechniqueTrade) -> str:

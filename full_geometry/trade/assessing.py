@@ -287,7 +287,7 @@ def _walked(on: Stage, sampled: list[Sampled], assessed: ObjectTrade, row: Techn
 def _denoised_wins(assessed: Assessment, job: Job) -> bool:
     """Whether denoised walks are the cheapest on each object that is seen, so that more of plain ones tells nothing."""
     seen = [(o, [row for row in o.ways if not row.refusal]) for o in assessed.objects if o.ways]
-    best = [min(rows, key=lambda row, o=o: job_seconds(o, row, job)) for o, rows in seen]
+    best = [min(rows, key=lambda row, o=o: o.job(row, job.tolerance, job.images)) for o, rows in seen]
     return all(Technique.of(row.way).denoised for row in best)
 
 
@@ -455,14 +455,7 @@ def corrected_chance(tolerance: float) -> float:
 
 def cheapest(assessed: ObjectTrade, job: Job) -> float:
     """Seconds of a job by the techniques that have been measured."""
-    return min((job_seconds(assessed, row, job) for row in assessed.ways if not row.refusal), default=math.inf)
-
-
-def job_seconds(assessed: ObjectTrade, row: TechniqueTrade, job: Job) -> float:
-    """Seconds of a job by a technique; infinite if it is not known to keep the tolerance."""
-    if not row.variance >= 0:
-        return math.inf
-    return row.job_seconds(job.images, assessed.pixels * samples_for(row, job.tolerance))
+    return min((assessed.job(row, job.tolerance, job.images)[0] for row in assessed.ways), default=math.inf)
 
 
 def contenders(assessed: ObjectTrade, tolerance: float) -> list[str]:

@@ -26,7 +26,7 @@ from full_geometry.settings import AUTO, GATHERED_LIGHTS, PATH_TRACED, Choices, 
 from full_geometry.surface.wrapped import surface_of
 from full_geometry.trade.advice import Advice, advise
 from full_geometry.trade.assessing import CANDIDATES, assess_for
-from full_geometry.trade.results import Assessment, ObjectTrade, TechniqueTrade, samples_for
+from full_geometry.trade.results import Assessment, ObjectTrade
 from full_geometry.trade.techniques import (
     CORRECTED,
     LAMBERT,
@@ -152,14 +152,14 @@ def picked(assessed: ObjectTrade, tolerance: float, light: str = "sampled", mode
         return Pick(name, 0.0, why)
     if not rows:
         return Pick(model, math.inf, f"object {assessed.object!r}: no model takes it in {light} light", False)
-    seconds = {name: cost(assessed, row, tolerance) for name, row in rows.items()}
+    seconds = {name: assessed.job(row, tolerance)[0] for name, row in rows.items()}
     name = min(rows, key=lambda name: (seconds[name], rows[name].bias_bound))
     keeps, row = seconds[name] < math.inf, rows[name]
     if keeps:
         why = f"{row.told_bias} % off, the tolerance is {100 * tolerance:.3g} %"
     else:
         why = f"the least wrong, {row.told_bias} % off; no model is known to keep {100 * tolerance:.3g} %"
-    walks = min(cost(assessed, row, tolerance) for row in assessed.ways if row.way.startswith(PATH_TRACED))
+    walks = min(assessed.job(row, tolerance)[0] for row in assessed.ways if row.way.startswith(PATH_TRACED))
     if walks < seconds[name]:
         why += "; translucent_walk would be better" + (" and faster" if keeps else ", which has no bias")
     return Pick(name, seconds[name], f"object {assessed.object!r}: {row.way}, {why}", keeps)
@@ -170,12 +170,6 @@ def _model(way: str, light: str) -> str:
     technique = Technique.of(way)
     same = technique == _way(technique.model, light) and not (technique.model == LAMBERT and light == CORRECTED)
     return technique.model if same and not technique.walks else ""
-
-
-def cost(assessed: ObjectTrade, row: TechniqueTrade, tolerance: float) -> float:
-    """Seconds of an image until bias and noise are at the tolerance; infinite for what is not known to get there."""
-    n = math.inf if row.refusal or not row.variance >= 0 else samples_for(row, tolerance)
-    return row.job_seconds(1, assessed.pixels * max(math.ceil(n), 1)) if n < math.inf else math.inf
 
 
 # --------------------------------------------------------------------------------------------------

@@ -157,6 +157,14 @@ class ObjectTrade:
                 return row
         raise ValueError(f"way must be one of {', '.join(row.way for row in self.ways)}, got {name!r}")
 
+    def job(self, row: TechniqueTrade, tolerance: float, images: int = 1) -> tuple[float, int]:
+        """Seconds of a job by a way, and samples of a pixel; infinite and 0 if it may not keep the tolerance."""
+        needed = samples_for(row, tolerance)
+        if not needed < math.inf:
+            return math.inf, 0
+        spp = max(math.ceil(needed), 1)
+        return row.job_seconds(images, self.pixels * spp), spp
+
     @property
     def traced(self) -> TechniqueTrade:
         return self.way(PATH_TRACED)
