@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from halfspace_sss.comparison.model_errors import in_single
-from halfspace_sss.comparison.truths import Truth, read_truths
+from halfspace_sss.comparison.truths import read_truths
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.measure.reflected_flux import reflectance_estimate
 from halfspace_sss.physics.fresnel import F_r
+from halfspace_sss.physics.medium import eval_hg, sample_hg
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.registry import bssrdf, models
 
@@ -86,7 +87,7 @@ def _by_position(model: BSSRDF, mu_i: np.ndarray, u: np.ndarray) -> _Points:
 
 def _by_lobe(model: BSSRDF, mu_i: np.ndarray, u: np.ndarray, g: float, width: float) -> _Points:
     """Directions of a Henyey-Greenstein lobe, mirrored upwards; positions near half their azimuth."""
-    cosine = (1 + g * g - ((1 - g * g) / (1 - g + 2 * g * u[2])) ** 2) / (2 * g)
+    cosine = sample_hg(u[2], g)
     sine, angle = np.sqrt(np.maximum(1 - cosine**2, 0)), 2 * math.pi * u[3]
     sin_i = np.sqrt((1 - mu_i) * (1 + mu_i))
     x = sin_i * cosine + mu_i * sine * np.cos(angle)
@@ -104,14 +105,10 @@ def _density(model: BSSRDF, p: _Points) -> np.ndarray:
     near = ((tau > NEAR[0]) & (tau < NEAR[1])) / (p.r * p.r * math.log(NEAR[1] / NEAR[0]))
     sines = np.sqrt((1 - p.mu_i) * (1 + p.mu_i) * (1 - p.mu_o) * (1 + p.mu_o)) * np.cos(p.delta)
     for g, width in LOBES:
-        lobe = _hg(sines + p.mu_i * p.mu_o, g) + _hg(sines - p.mu_i * p.mu_o, g)
+        lobe = eval_hg(sines + p.mu_i * p.mu_o, g) + eval_hg(sines - p.mu_i * p.mu_o, g)
         cauchy = math.sinh(width) / (2 * math.pi * (math.cosh(width) - np.cos(p.psi - 0.5 * p.delta)))
         result = result + _weight(p.mu_i) * near * lobe * cauchy
     return result
-
-
-def _hg(cosine: np.ndarray, g: float) -> np.ndarray:
-    return (1 - g * g) / (4 * math.pi * (1 + g * g - 2 * g * cosine) ** 1.5)
 
 
 MEASURES = ("R_d", "R_total")
@@ -129,19 +126,19 @@ def reflectance_truths(
     import pandas
 
     names, result = list(models() if names is None else names), {} if kept is None else kept
-    truths, rows = _reflectances(), []
+    truths, rows = [t for t in read_truths()[0] if t.measure in MEASURES and float(t.medium.albedo) > 0], []
     for k, t in enumerate(truths):
         for name in names:
-            model = _model(name, t)
-            if model is None:
-                continue
-            key = _key(model, t)
+            try:
+                model, m = bssrdf(name, t.medium), t.medium
+            except ValueError:
+                continue  # the model refuses this medium
+            key = f"{name} {' '.join(model.checksums)} {float(m.albedo)!r} {float(m.g)!r} {m.eta!r} {t.mu_i}"
             if key not in result:
                 result[key] = _reflectance(model, t.mu_i)
             R, error = (t.factor * v for v in result[key])
             if t.measure == "R_total":
-                R += float(F_r(t.mu_i, t.medium.eta))
-            m = t.medium
+                R += float(F_r(t.mu_i, m.eta))
             row = {"id": t.id, "kind": t.kind, "model": name, "albedo": float(m.albedo), "g": float(m.g), "eta": m.eta}
             rows.append(
                 row | {"mu_i": t.mu_i, "truth": t.value, "value": R, "error": error, "relative_error": R / t.value - 1}
@@ -149,23 +146,6 @@ def reflectance_truths(
         if progress:
             progress("truths", k + 1, len(truths))
     return pandas.DataFrame(rows)
-
-
-def _reflectances() -> list[Truth]:
-    return [t for t in read_truths()[0] if t.measure in MEASURES and float(t.medium.albedo) > 0]
-
-
-def _model(name: str, t: Truth) -> BSSRDF | None:
-    """None if the model refuses the medium."""
-    try:
-        return bssrdf(name, t.medium)
-    except ValueError:
-        return None
-
-
-def _key(model: BSSRDF, t: Truth) -> str:
-    m = t.medium
-    return f"{model.name} {' '.join(model.checksums)} {float(m.albedo)!r} {float(m.g)!r} {m.eta!r} {t.mu_i}"
 
 
 def _reflectance(model: BSSRDF, mu_i: float | str) -> list[float]:

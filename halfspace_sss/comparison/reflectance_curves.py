@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import numbers
 import time
@@ -141,39 +142,32 @@ def curves(
     chosen, notes = _chosen_models(models, medium)
     n_paths = default_paths(medium, backend) if n_paths is None else n_paths
     passes = launch_shape(n_paths, backend == "cuda")[2] if n_paths else 0
-    steps = _Steps(progress, len(angles) * (passes + len(chosen)) + len(chosen))
+    total, done = len(angles) * (passes + len(chosen)) + len(chosen), itertools.count()
+
+    def advance(*_: int) -> None:
+        if progress:
+            progress(next(done), total)
+
+    advance()
     results, walks, seconds = [], 0, 0.0
     for k, theta in enumerate(angles):
         if n_paths:
-            traced = trace_curve(medium, math.cos(math.radians(theta)), line, n_paths, seed + k, backend, steps.advance)
+            traced = trace_curve(medium, math.cos(math.radians(theta)), line, n_paths, seed + k, backend, advance)
             walks, seconds = traced.n_paths, seconds + traced.seconds
             R = {order: tuple(traced.reflectance(order)) for order in ("multiple", "total")}
             results.append(Curve(TRACED, "multiple", theta, traced.S, traced.S, traced.standard_error, R))
         for model in chosen:
             results.append(_modelled(model, theta, line, orders))
-            steps.advance()
+            advance()
     speeds = {}
     for model in chosen:
         speeds[model.name] = _evaluations_per_s(model, line)
-        steps.advance()
+        advance()
     return CurveSet(
         title=title, medium=medium, theta_o_deg=float(theta_o_deg), delta_phi_deg=float(delta_phi_deg),
         line_deg=float(line_deg), half_width=half_width, orders=orders, r_edges=line.r_edges, curves=tuple(results),
         evaluations_per_s=speeds, n_paths=walks, seed=seed, backend=backend, seconds=seconds, notes=notes,
     )  # fmt: skip
-
-
-class _Steps:
-    """Counts the work done for `progress`."""
-
-    def __init__(self, progress: Progress | None, total: int) -> None:
-        self.progress, self.total, self.done = progress, total, -1
-        self.advance()
-
-    def advance(self, *_: int) -> None:
-        self.done += 1
-        if self.progress:
-            self.progress(self.done, self.total)
 
 
 def _modelled(model: BSSRDF, theta_deg: float, line: Line, orders: str) -> Curve:
