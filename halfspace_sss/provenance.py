@@ -6,6 +6,7 @@ import contextlib
 import errno
 import functools
 import json
+import math
 import os
 import platform
 import subprocess
@@ -59,6 +60,15 @@ def provenance(**parameters: object) -> JsonDict:
         "versions": {"python": platform.python_version(), **versions},
         "commit": _commit(),
     }
+
+
+def without_nan(value: object) -> Json:
+    """With None in place of nan and infinities, which JSON has not."""
+    if isinstance(value, dict):
+        return {key: without_nan(v) for key, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [without_nan(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def path_of(path: str | os.PathLike[str]) -> Path:

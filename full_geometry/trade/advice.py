@@ -29,7 +29,7 @@ import numpy as np
 from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.settings import GATHERED_LIGHTS
 from full_geometry.trade.assessing import assess
-from full_geometry.trade.results import UNNAMED, Assessment, ObjectTrade, TechniqueTrade, html_table, plain
+from full_geometry.trade.results import UNNAMED, Assessment, ObjectTrade, TechniqueTrade, html_table
 from full_geometry.trade.techniques import CORRECTED, LAMBERT, WALKED, Job, Technique
 from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.comparison.curve_set import TRACED
@@ -38,6 +38,7 @@ from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.neural.network import channels
 from halfspace_sss.noise_free import NoiseFree, short
 from halfspace_sss.physics.medium import Medium, medium_of
+from halfspace_sss.provenance import without_nan
 from halfspace_sss.registry import bssrdf
 from halfspace_sss.registry import models as registered
 
@@ -295,7 +296,7 @@ class FlatAdvice:
 
     def record(self) -> dict[str, Any]:
         """Ready for JSON; what is not finite, as of a model that refuses, is None there."""
-        return plain(asdict(self))
+        return without_nan(asdict(self))
 
     def table(self) -> pandas.DataFrame:
         """One row for each way."""

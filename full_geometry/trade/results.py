@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from full_geometry.scenes.scene_files import PATH_TRACED
 from halfspace_sss.noise_free import NoiseFree
+from halfspace_sss.provenance import without_nan
 
 if TYPE_CHECKING:
     import pandas
@@ -220,7 +221,7 @@ class Assessment:
 
     def record(self) -> dict[str, Any]:
         """Ready for JSON; what is not known is None there."""
-        return plain(asdict(self))
+        return without_nan(asdict(self))
 
 
 def _known(key: str, value: object) -> object:
@@ -228,15 +229,6 @@ def _known(key: str, value: object) -> object:
     if key in ("ratio", "ratio_error"):
         return tuple(math.nan if v is None else v for v in value)
     return math.nan if value is None and key not in ("flip", "flip_noise") else value
-
-
-def plain(value: object) -> object:
-    """Without nan, which JSON has not."""
-    if isinstance(value, dict):
-        return {key: plain(v) for key, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def html_table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -273,7 +273,7 @@ def write_results(result: Validation, folder: Path) -> None:
     import pandas
 
     from halfspace_sss.comparison.truths import Z_LIMIT
-    from halfspace_sss.provenance import provenance, write_together
+    from halfspace_sss.provenance import provenance, without_nan, write_together
 
     records = [_record(c) for c in result.comparisons]
     content = {
@@ -284,17 +284,8 @@ def write_results(result: Validation, folder: Path) -> None:
         "not_covered": [vars(n) for n in result.not_covered],
         "rows": records,
     }
-    about = json.dumps(_strict(content), indent=1, allow_nan=False) + "\n"
+    about = json.dumps(without_nan(content), indent=1, allow_nan=False) + "\n"
     write_together({folder / "validate.csv": csv_of(pandas.DataFrame(records)), folder / "validate.json": about})
-
-
-def _strict(value: object) -> object:
-    """The value with None in place of infinities and NaN, which JSON does not know."""
-    if isinstance(value, dict):
-        return {key: _strict(v) for key, v in value.items()}
-    if isinstance(value, list):
-        return [_strict(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def validate(
