@@ -30,6 +30,7 @@ from typing import Any, NamedTuple, Protocol
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.ndimage import uniform_filter
 
 from full_geometry.geometry.sensors import seeded
 from full_geometry.inverse.views import GivenView, edit
@@ -159,12 +160,8 @@ class ChiSquare(NamedTuple):
 
 def neighbour_sums(z: np.ndarray, reach: int) -> np.ndarray:
     """Sums over squares of pixels about each pixel of an image (height, width, channels)."""
-    for axis in (0, 1):
-        padding = [(reach + 1, reach) if a == axis else (0, 0) for a in range(3)]
-        summed = np.cumsum(np.pad(z, padding), axis=axis)
-        n = z.shape[axis]
-        z = np.take(summed, np.arange(n) + 2 * reach + 1, axis) - np.take(summed, np.arange(n), axis)
-    return z
+    side = 2 * reach + 1
+    return side**2 * uniform_filter(z, (side, side, 1), mode="constant")
 
 
 class FittedView(NamedTuple):

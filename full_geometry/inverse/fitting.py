@@ -22,6 +22,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.linalg import null_space
 
 from full_geometry.inverse.comparing import (
     CERTAIN,
@@ -39,6 +40,7 @@ from full_geometry.inverse.comparing import (
     means_of_arrays,
 )
 from full_geometry.inverse.parameters import FitParameters, check_derivatives, translucent_object
+from full_geometry.inverse.textures import TextureDescent, TextureParameters
 from full_geometry.inverse.views import GivenView, check_views
 from full_geometry.scenes.scene_files import PATH_TRACED, open_scene
 from full_geometry.settings import check_variant
@@ -92,8 +94,6 @@ def fit(
     work = None if work is None else check_folder(work)
     comparison, textured = ViewComparison(scene, list(images), settings), surface_of(shape).spec.textured is not None
     if textured:
-        from full_geometry.inverse.textures import TextureDescent, TextureParameters  # scipy
-
         descent = TextureDescent(comparison, TextureParameters.of(parameters, shape, mm_per_unit, scene))
     else:
         descent = MediumDescent(comparison, FitParameters.of(parameters, shape, mm_per_unit))
@@ -185,7 +185,7 @@ class MediumDescent:
         self.steps: list[FitStep] = []
         self.x = parameters.start()
         n = len(comparison.fitted) if comparison.settings.exposure else 1
-        self.free = _of_sum_0(n)  # directions of log exposures, shape (views, views - 1)
+        self.free = null_space(np.ones((1, n)))  # directions of log exposures of sum 0, shape (views, views - 1)
         self.means: dict[int, ViewMeans] = {}
 
     def fingerprint(self) -> str:
@@ -346,11 +346,6 @@ def _solved(H: np.ndarray, g: np.ndarray) -> np.ndarray:
     e, v = np.linalg.eigh(H * np.outer(scale, scale))
     e = np.maximum(np.abs(e), DAMPED * max(np.abs(e).max(), 1e-30))
     return np.diag(scale) @ (v / e) @ (v.T @ (np.diag(scale) @ g))
-
-
-def _of_sum_0(n: int) -> np.ndarray:
-    """An orthonormal basis of vectors of n numbers whose sum is 0, shape (n, n - 1)."""
-    return np.linalg.svd(np.ones((1, n)))[2][1:].T
 
 
 def _numbers(x: mi.Float | mi.Spectrum) -> np.ndarray:
