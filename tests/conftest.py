@@ -124,7 +124,7 @@ def commands_made_once() -> Iterator[None]:
 def speeds_are_measured_shortly() -> Iterator[None]:
     """Of models in a set of curves, for a hundredth of a second each in place of a tenth."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(reflectance_curves._evaluations_per_s, "__defaults__", (4096, 0.01))
+        patch.setattr(reflectance_curves.evaluations_per_s, "__defaults__", (4096, 0.01))
         yield
 
 

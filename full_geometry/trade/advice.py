@@ -29,12 +29,12 @@ import numpy as np
 from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.settings import GATHERED_LIGHTS
 from full_geometry.trade.assessing import assess
-from full_geometry.trade.results import UNNAMED, Assessment, ObjectTrade, TechniqueTrade, html_table
+from full_geometry.trade.results import UNNAMED, Assessment, ObjectTrade, TechniqueTrade
 from full_geometry.trade.techniques import CORRECTED, LAMBERT, WALKED, Job, Technique
 from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.comparison.curve_set import TRACED
 from halfspace_sss.comparison.model_errors import TracedMaps, model_error, references
-from halfspace_sss.interface.model import BSSRDF
+from halfspace_sss.comparison.reflectance_curves import evaluations_per_s
 from halfspace_sss.neural.network import channels
 from halfspace_sss.noise_free import NoiseFree, short
 from halfspace_sss.physics.medium import Medium, medium_of
@@ -100,16 +100,21 @@ class Advice:
         return f"<{self.integrator} for a tolerance of {self.tolerance:.3g}; {ways}>"
 
     def _repr_html_(self) -> str:
-        return html_table(("object", "way", "error", "seconds", ""), [
-            (each.object, o.way, f"{o.error:.3g}", f"{o.seconds:.3g}", o.why)
-            for each in self.objects for o in each.options
-        ])  # fmt: skip
+        return _html([{"object": each.object, **asdict(option)} for each in self.objects for option in each.options])
 
     def __str__(self) -> str:
         text = [str(each) for each in self.objects]
         if len(self.objects) > 1:
             text.append(f"all objects together: {self.integrator}, {_time(self.seconds)}")
         return "\n".join(text)
+
+
+def _html(rows: list[dict[str, Any]]) -> str:
+    """A table with whole sentences."""
+    import pandas
+
+    with pandas.option_context("display.max_colwidth", None):
+        return pandas.DataFrame(rows).to_html(index=False, float_format="{:.3g}".format)
 
 
 def recommend(
@@ -258,7 +263,6 @@ def _time(seconds: float) -> str:
 
 
 EVENTS = 4e6  # of the walks of each channel
-QUERIES = 2**12
 REACH = (0.02, 60.0)  # mean free paths that are compared where no range is given
 
 
@@ -287,9 +291,7 @@ class FlatAdvice:
         return f"<{self.model} for a tolerance of {self.tolerance:.3g}, of {len(self.options)} ways>"
 
     def _repr_html_(self) -> str:
-        return html_table(("way", "error", "seconds a million", ""), [
-            (o.model, f"{o.error:.3g}", f"{o.seconds_per_million:.3g}", o.why) for o in self.options
-        ])  # fmt: skip
+        return _html([asdict(option) for option in self.options])
 
     def __str__(self) -> str:
         return "\n".join(option.why for option in self.options)
@@ -401,20 +403,8 @@ def _row(name: str, media: list[Medium], maps: list[TracedMaps], within: list[tu
         e = model_error(model, one, bounds)
         errors.append(e.known)
         noises.append(e.noise)
-        seconds += _seconds(model)
+        seconds += 1 / evaluations_per_s(model, 0.01, 10.0, least_seconds=0.01)
     return _Row(name, max(errors, key=lambda e: e.bound), max(noises), seconds / len(media))
-
-
-def _seconds(model: BSSRDF) -> float:
-    """Seconds of one value of S in NumPy."""
-    rng = np.random.default_rng(0)
-    r, mu = 10 ** rng.uniform(-2, 1, QUERIES), rng.uniform(0.05, 1, (2, QUERIES))
-    took = []
-    for _ in range(2):
-        started = time.perf_counter()
-        model.eval(r, mu[0], 0.3, mu[1], 1.0)
-        took.append(time.perf_counter() - started)
-    return min(took) / QUERIES
 
 
 def _advice(rows: list[_Row], tolerance: float, r: tuple[float, float], unit: str) -> FlatAdvice:

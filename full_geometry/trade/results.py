@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
-from html import escape
 from typing import TYPE_CHECKING, Any
 
 from full_geometry.scenes.scene_files import PATH_TRACED
@@ -229,10 +227,3 @@ def _known(key: str, value: object) -> object:
     if key in ("ratio", "ratio_error"):
         return tuple(math.nan if v is None else v for v in value)
     return math.nan if value is None and key not in ("flip", "flip_noise") else value
-
-
-def html_table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    def row(cells: Sequence[str], kind: str) -> str:
-        return "<tr>" + "".join(f"<{kind}>{escape(str(cell))}</{kind}>" for cell in cells) + "</tr>"
-
-    return "<table>" + row(headings, "th") + "".join(row(cells, "td") for cells in rows) + "</table>"

@@ -161,7 +161,7 @@ def curves(
             advance()
     speeds = {}
     for model in chosen:
-        speeds[model.name] = _evaluations_per_s(model, line)
+        speeds[model.name] = evaluations_per_s(model, *line.r_edges[[0, -1]])
         advance()
     return CurveSet(
         title=title, medium=medium, theta_o_deg=float(theta_o_deg), delta_phi_deg=float(delta_phi_deg),
@@ -181,10 +181,10 @@ def _modelled(model: BSSRDF, theta_deg: float, line: Line, orders: str) -> Curve
     return Curve(model.name, model.orders, theta_deg, S, S_at_r, np.zeros_like(S), {order: (R, error)})
 
 
-def _evaluations_per_s(model: BSSRDF, line: Line, n: int = 4096, least_seconds: float = 0.1) -> float:
-    """Evaluations of S per second in batches of n, NumPy, float64, at random queries within the range of r."""
+def evaluations_per_s(model: BSSRDF, low: float, high: float, n: int = 4096, least_seconds: float = 0.1) -> float:
+    """Evaluations of S per second in batches of n, NumPy, float64, at random queries with r from low to high."""
     rng = np.random.default_rng(0)
-    r = np.exp(rng.uniform(*np.log(line.r_edges[[0, -1]]), n))
+    r = np.exp(rng.uniform(*np.log((low, high)), n))
     query = (r, rng.random(n), rng.uniform(-math.pi, math.pi, n), rng.random(n), rng.uniform(-math.pi, math.pi, n))
     model.eval(*query)
     done, started = 0, time.perf_counter()
