@@ -57,20 +57,6 @@ def test_azimuths_in_degrees_become_radians():
     assert row.direction == pytest.approx((0.5, math.pi))
 
 
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("T1,exact,R_d,half-space,0.5,0,1,1,,,,lots,1e-8,,", "table.csv, row T1: value must be a number, got 'lots'"),
-        ("T1,exact,R_d,half-space,0.5,0,1,1,,,,0.1,-1,,", "row T1: uncertainty must be a number >= 0 .* got '-1'"),
-        ("T1,exact,R_d,half-space,1.5,0,1,1,,,,0.1,0,,", "row T1: albedo must be in .0, 1., got .*1.5"),
-        ("T1,exact,R_d(r) ring mean [1/cm^2],half-space,0.5,0,1,1,,,x,0.1,0,,", "row T1: other must hold a ring"),
-    ],
-)
-def test_a_row_that_cannot_be_read_is_refused_with_file_row_and_column(tmp_path, line, message):
-    with pytest.raises(ValueError, match=message):
-        read_truths(table(tmp_path, line))
-
-
 def test_the_first_order_traced_alone_is_the_exact_single_order():
     medium = Medium.from_albedo(0.7, 2.0, 0.4, 1.3)
     for mu_i in (0.6, "diffuse"):
