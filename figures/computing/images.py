@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from full_geometry.trade.image_differences import check_image, flip_ldr, luminance, relative_mse, srgb
+from full_geometry.trade.image_differences import FLOOR, check_image, flip_ldr, luminance, relative_mse, srgb
 
 
 def stops_of(reference: np.ndarray, mask: np.ndarray) -> float:
@@ -21,7 +21,6 @@ def noise_of(image: np.ndarray, variance: np.ndarray, mask: np.ndarray) -> float
 
 
 FLIP, RELATIVE_MSE = "FLIP", "relMSE"
-FLOOR = 0.01  # squared radiance, as in the relative error
 
 
 @dataclass(frozen=True)
@@ -74,7 +73,7 @@ def compared(
         ValueError: the images cannot be compared; see `full_geometry.trade.image_differences`.
     """
     image = np.maximum(image, 0)
-    relative = relative_mse(reference, image, mask=mask, floor=FLOOR)
+    relative = relative_mse(reference, image, mask=mask)
     flip = flip_ldr(srgb(reference, exposure), srgb(image, exposure), mask=mask)
     a, b = luminance(reference), luminance(image)
     results = {FLIP: flip.mean, RELATIVE_MSE: relative.mean, **(numbers or {})}

@@ -5,11 +5,11 @@ Everything is checked here before the evaluator of FLIP is called, because it en
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from halfspace_sss.checks import check_finite, check_interval
+from halfspace_sss.checks import check_finite
 
 LARGEST = 1e12  # radiance; squares of it, as tone mapping takes them, still fit float32
 
@@ -48,56 +48,40 @@ def check_image(name: str, image: np.ndarray, largest: float = LARGEST) -> np.nd
 
 PIXELS_PER_DEGREE = 67.0206  # FLIP's own: a 0.69 m wide display of 3840 pixels seen from 0.7 m
 SMALLEST_SIDE = 4  # pixels
+FLOOR = 0.01  # squared radiance, which keeps black pixels from deciding a mean
 
 
 class Difference(NamedTuple):
-    """Map (H, W) of a difference, its mean over the pixels that count, and the settings it was taken with."""
+    """Map (H, W) of a difference, and its mean over the pixels that count."""
 
     map: np.ndarray
     mean: float
-    settings: dict[str, Any]
 
 
-def flip_ldr(
-    reference: np.ndarray, test: np.ndarray, *, mask: np.ndarray | None = None,
-    pixels_per_degree: float = PIXELS_PER_DEGREE,
-) -> Difference:  # fmt: skip
+def flip_ldr(reference: np.ndarray, test: np.ndarray, *, mask: np.ndarray | None = None) -> Difference:
     """FLIP between two images as displayed: what an observer sees when flipping between them, 0 to 1.
-
-    Args:
-        reference, test: sRGB-encoded images (H, W, 3) in [0, 1], as `srgb` makes them.
-        mask: (H, W), true where a pixel counts for the mean; the map covers all.
-        pixels_per_degree: of visual angle; the default is FLIP's.
-
-    Raises:
-        ValueError: shape, size or range is wrong; names the argument and the pixel.
+    `reference`, `test`: sRGB-encoded images (H, W, 3) in [0, 1], as `srgb` makes them. `mask`: (H, W), true where a
+    pixel counts for the mean; the map covers all. ValueError if shape, size or range is wrong.
 
     Source: Andersson et al., FLIP: A Difference Evaluator for Alternating Images, HPG 2020.
     """
     reference, test, inside = _checked(reference, test, mask, largest=1.0)
-    check_interval("pixels_per_degree", pixels_per_degree, 1.0, 1e4)
     import flip_evaluator
 
-    parameters = {"ppd": float(pixels_per_degree)}
-    error, _, used = flip_evaluator.evaluate(
-        reference, test, "LDR", applyMagma=False, computeMeanError=False, parameters=parameters
+    error, _, _ = flip_evaluator.evaluate(
+        reference, test, "LDR", applyMagma=False, computeMeanError=False, parameters={"ppd": PIXELS_PER_DEGREE}
     )
     shown = np.clip(error[..., 0], 0.0, 1.0)
-    return Difference(shown, float(shown[inside].mean(dtype=np.float64)), {"ppd": used["ppd"]})
+    return Difference(shown, float(shown[inside].mean(dtype=np.float64)))
 
 
-def relative_mse(
-    reference: np.ndarray, test: np.ndarray, *, mask: np.ndarray | None = None, floor: float = 0.01
-) -> Difference:
-    """Relative squared error (test - reference)² / (reference² + floor) of linear images, mean of the channels.
-    `reference`, `test`: linear radiance (H, W, 3), finite and >= 0. `mask`: (H, W), true where a pixel counts for the
-    mean; the map covers all. `floor`: squared radiance, > 0; keeps black pixels from deciding the mean. ValueError if
-    an argument is out of range."""
+def relative_mse(reference: np.ndarray, test: np.ndarray, *, mask: np.ndarray | None = None) -> Difference:
+    """Relative squared error (test - reference)² / (reference² + FLOOR), mean of the channels.
+    `reference`, `test`: linear radiance (H, W, 3), finite and >= 0. `mask`: as of `flip_ldr`. ValueError likewise."""
     reference, test, inside = _checked(reference, test, mask)
-    check_interval("floor", floor, 1e-12, 1e12)
     a, b = reference.astype(np.float64), test.astype(np.float64)
-    error = ((b - a) ** 2 / (a * a + floor)).mean(axis=2)
-    return Difference(error, float(error[inside].mean()), {"floor": float(floor)})
+    error = ((b - a) ** 2 / (a * a + FLOOR)).mean(axis=2)
+    return Difference(error, float(error[inside].mean()))
 
 
 def _checked(
@@ -108,16 +92,13 @@ def _checked(
         raise ValueError(f"test must have the shape of reference {a.shape}, got {b.shape}")
     if min(a.shape[:2]) < SMALLEST_SIDE:
         raise ValueError(f"reference must be at least {SMALLEST_SIDE} pixels wide and high, got {a.shape}")
-    return a, b, _checked_mask(mask, a.shape[:2])
-
-
-def _checked_mask(mask: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
+    shape = a.shape[:2]
     inside = np.ones(shape, dtype=bool) if mask is None else np.asarray(mask)
     if inside.dtype != bool or inside.shape != shape:
         raise ValueError(f"mask must be true or false in the shape {shape}, got {inside.dtype} in {inside.shape}")
     if not inside.any():
         raise ValueError("mask must be true for at least one pixel, got none")
-    return inside
+    return a, b, inside
 
 
 WHITE = 0.9  # encoded luminance of the bright end

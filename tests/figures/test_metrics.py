@@ -58,16 +58,9 @@ def test_flip_is_what_the_evaluator_gives() -> None:
     assert found.mean == pytest.approx(mean, abs=1e-4)
 
 
-def test_seen_from_farther_away_noise_is_a_smaller_difference() -> None:
-    a, b = _picture(), _noisy(_picture(), 0.1)
-    near, far = (flip_ldr(a, b, pixels_per_degree=ppd).mean for ppd in (20, 150))
-    assert far < near
-
-
 def test_relative_error_is_its_formula() -> None:
     a, b = np.full((4, 4, 3), 2.0), np.full((4, 4, 3), 2.5)
     assert relative_mse(a, b).mean == pytest.approx(0.25 / 4.01)
-    assert relative_mse(a, b, floor=1.0).mean == pytest.approx(0.25 / 5)
 
 
 def test_the_display_curve_is_that_of_srgb() -> None:
@@ -91,8 +84,6 @@ _NAN, _NEGATIVE, _BRIGHT = (np.where(np.arange(192).reshape(8, 8, 3) == 100, v, 
         *((m, (_GOOD, _GOOD), {"mask": np.zeros((8, 8), bool)}, "mask must be true for at least") for m in METRICS),
         *((m, (_GOOD, _GOOD), {"mask": np.ones((8, 9), bool)}, "mask must be true or false") for m in METRICS),
         (flip_ldr, (_GOOD, _BRIGHT), {}, r"test must be finite and in \[0, 1\], got 1.5"),
-        (flip_ldr, (_GOOD, _GOOD), {"pixels_per_degree": 0}, "pixels_per_degree must be a number in"),
-        (relative_mse, (_GOOD, _GOOD), {"floor": 0}, "floor must be a number in"),
     ],
 )  # fmt: skip
 def test_bad_input_is_refused(metric: Any, arguments: tuple, options: dict[str, Any], message: str) -> None:
