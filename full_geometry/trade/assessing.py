@@ -99,7 +99,11 @@ def assess(
     how = Effort(**effort)
     check_interval("seconds", how.seconds, 0.05, 1e5)
     check_interval("train_seconds", train_seconds, 0.0, 1e7)
-    chosen = _chosen(models if models is not None or job is None else CANDIDATES)
+    if models is None and job is None:
+        chosen = techniques()
+    else:
+        named = [Technique.of(name) for name in (CANDIDATES if models is None else models)]
+        chosen = [WALKS, *(technique for technique in dict.fromkeys(named) if not technique.exact)]
     on = stage(scene, parameters)
     check_sensor(on.scene, how.sensor)
     if train_seconds > 0:
@@ -109,13 +113,6 @@ def assess(
     else:
         result = assess_for(on, chosen, job, how, progress, every=bool(models))
     return with_flip(on, chosen, result, how.sensor, how.seed) if flip else result
-
-
-def _chosen(models: Sequence[str] | None) -> list[Technique]:
-    if models is None:
-        return techniques()
-    chosen = [Technique.of(name) for name in models]
-    return [WALKS, *(technique for technique in dict.fromkeys(chosen) if not technique.exact)]
 
 
 def assess_stage(
@@ -461,11 +458,10 @@ def cheapest(assessed: ObjectTrade, job: Job) -> float:
 def contenders(assessed: ObjectTrade, tolerance: float) -> list[str]:
     """Ways beside walks that may keep the tolerance, and may be the cheapest that does."""
     rows = [row for row in assessed.ways if not row.refusal and row.variance >= 0]
-    best = min((samples_for(row, tolerance) * row.seconds for row in rows), default=math.inf)
-    return [row.way for row in rows if row.way != PATH_TRACED and _at_best(row, tolerance) < CLOSE * best]
-
-
-def _at_best(row: TechniqueTrade, tolerance: float) -> float:
-    """Seconds for a pixel if the bias is as small as it may be."""
-    left = tolerance**2 - max(row.bias2 - DOUBT * row.bias2_error, 0.0)
-    return row.time_to(math.sqrt(left)) if left > 0 else math.inf
+    best, found = min((samples_for(row, tolerance) * row.seconds for row in rows), default=math.inf), []
+    for row in rows:
+        # seconds for a pixel if the bias is as small as it may be
+        left = tolerance**2 - max(row.bias2 - DOUBT * row.bias2_error, 0.0)
+        if row.way != PATH_TRACED and left > 0 and row.time_to(math.sqrt(left)) < CLOSE * best:
+            found.append(row.way)
+    return found
