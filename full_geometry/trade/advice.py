@@ -343,11 +343,18 @@ def recommend_flat(
     result = references([m.in_mfp() for m in parts], events * len(parts), seed, 4)
     tracing = time.perf_counter() - started
     within = [(r[0] * float(m.sigma_t), r[1] * float(m.sigma_t)) if r else REACH for m in parts]
-    for m, one, bounds in zip(parts, result, within):
-        _check_light(m, one, bounds)
+    values = 0
+    for m, one, (low, high) in zip(parts, result, within):
+        energies, radii = one.energies(), one.block_radii()
+        lit = ((radii >= low) & (radii <= high))[:, None, None, :, None]
+        if not (energies * lit).sum() > 0:
+            raise ValueError(
+                f"r must hold distances at which light comes back, got {low:.3g} to {high:.3g} mean free paths for "
+                f"albedo {float(m.albedo):.4g}; walks reach {radii.min():.2g} to {radii.max():.3g}"
+            )
+        values += int(np.broadcast_to(lit, energies[:, :1].shape).sum())  # of S, of cells and pairs of directions
     rows = [_row(name, parts, result, within) for name in models or registered()]
     noise = max((row.noise for row in rows if row.noise < math.inf), default=math.inf)
-    values = sum(_values(one, bounds) for one, bounds in zip(result, within))
     rows.append(_Row(TRACED, NoiseFree(0.0, 0.0), tolerance, tracing * (noise / tolerance) ** 2 / values))
     return _advice(rows, tolerance, r or REACH, "mm" if r else "mean free paths")
 
@@ -361,26 +368,6 @@ def _check_range(r: tuple[float, float] | None) -> None:
     check_interval("r[1]", r[1], 0.0, 1e9)
     if not r[0] < r[1]:
         raise ValueError(f"r must ascend, got {r!r}")
-
-
-def _lit(maps: TracedMaps, within: tuple[float, float]) -> np.ndarray:
-    """Which cells count: an array that fits energies of halves."""
-    radii = maps.block_radii()
-    return ((radii >= within[0]) & (radii <= within[1]))[:, None, None, :, None]
-
-
-def _values(maps: TracedMaps, within: tuple[float, float]) -> int:
-    """How many values of S the walks have found, of cells and pairs of directions."""
-    return int(np.broadcast_to(_lit(maps, within), maps.energies()[:, :1].shape).sum())
-
-
-def _check_light(m: Medium, maps: TracedMaps, within: tuple[float, float]) -> None:
-    if not (maps.energies() * _lit(maps, within)).sum() > 0:
-        (low, high), radii = within, maps.block_radii()
-        raise ValueError(
-            f"r must hold distances at which light comes back, got {low:.3g} to {high:.3g} mean free paths for "
-            f"albedo {float(m.albedo):.4g}; walks reach {radii.min():.2g} to {radii.max():.3g}"
-        )
 
 
 class _Row(NamedTuple):

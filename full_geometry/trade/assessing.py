@@ -251,10 +251,12 @@ def _denoise(
     found = samples.assessment().objects
     seen = [k for k, o in enumerate(found) if o.ways and not o.is_dark]
     plain = {t: replace(t, denoised=False) for t in asked}
-    costs = {t: sum(_noise_cost(found[k], plain[t].name) for k in seen) for t in asked}
-    best = min(costs, key=lambda t: costs[t], default=None)
+    by = {t: {k: _plain(found[k], plain[t].name) for k in seen} for t in asked}
+    # variance of a sample times its seconds
+    costs = {t: sum(math.inf if w.refusal else w.variance * w.seconds for w in by[t].values()) for t in asked}
+    best = min(costs, key=lambda t: costs[t])
     for technique in asked if seen else ():
-        rows = {k: _plain(found[k], plain[technique].name) for k in seen}
+        rows = by[technique]
         reason = next((row.refusal for row in rows.values() if row.refusal), "")
         if not samples.on.scene.sensors()[samples.effort.sensor].film().rfilter().is_box_filter():
             reason = "the film must have a box filter for a denoiser"
@@ -291,12 +293,6 @@ def _denoised_wins(assessed: Assessment, job: Job) -> bool:
 def _plain(assessed: ObjectTrade, name: str) -> TechniqueTrade:
     rows = [row for row in assessed.ways if row.way == name]
     return rows[0] if rows else TechniqueTrade(name, refusal=f"{name} is not among the techniques")
-
-
-def _noise_cost(assessed: ObjectTrade, name: str) -> float:
-    """Variance of a sample times its seconds."""
-    row = _plain(assessed, name)
-    return math.inf if row.refusal else row.variance * row.seconds
 
 
 def learn(on: Stage, seconds: float, seed: int = 0, progress: NamedProgress | None = None) -> None:

@@ -132,7 +132,9 @@ def denoised_rows(
             break
 
     # ---- the law of each object about the samples that keep the tolerance
-    of_image = _denoising_seconds() * math.prod(film) / len(seen)
+    black = np.zeros((TIMED, TIMED, 3), dtype=np.float32)
+    # two halves are denoised, and guides take as long as one of them
+    of_image = 3 * denoised(black, black, black)[1] / black[..., 0].size * math.prod(film) / len(seen)
     rows: list[TechniqueTrade | None] = [None] * len(found)
     for k, n in zip(seen, ends):
         plain, e = found[k].row, laws[k].at(n)
@@ -269,13 +271,6 @@ def _inner(size: np.ndarray, corner: np.ndarray, film: tuple[int, int]) -> np.nd
         near = (lines < MARGIN) & (corner[axis] > 0)
         inner.append(~(near | ((lines >= size[axis] - MARGIN) & (corner[axis] + size[axis] < film[axis]))))
     return inner[0][:, None] & inner[1][None]
-
-
-def _denoising_seconds() -> float:
-    """Seconds beside the samples of an image for each of its pixels: two halves are denoised, and guides take as long
-    as one of them."""
-    black = np.zeros((TIMED, TIMED, 3), dtype=np.float32)
-    return 3 * denoised(black, black, black)[1] / black[..., 0].size
 
 
 def _aovs_of(scene: mi.Scene) -> Callable[..., list[mi.Float]]:

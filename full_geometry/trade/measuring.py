@@ -264,8 +264,11 @@ def _row(
             own, precisely = _of_precomputed(walked, known), mean_square(parts, known, kept)
             precisely = Number(precisely.value, math.hypot(precisely.error, max(own.value, 0.0) + own.error))
             bias2 = min(bias2, precisely, key=lambda each: each.error)
-    if walked.blur:
-        doubt = _of_blur(walked.blur, walked.estimate)
+    if blurred := walked.blur:
+        # an upper estimate of its squared bias; where no sample shows any blurred light, by the rule of three
+        square = mean_square_of(blurred, walked.estimate)
+        least = 3 / (BLUR_SEEN * blurred.samples * blurred.mean.shape[1])
+        doubt = Number(BLUR_EFFECT**2 * square.value, BLUR_EFFECT**2 * math.hypot(square.error, least**2))
     # Add what the blur of delta lights may be off by to its standard error.
     bias2 = Number(bias2.value + max(doubt.value, 0.0), math.hypot(bias2.error, doubt.error))
     ratios = [(1.0, 0.0) if technique.exact else ratio_of_means(cost, b, c) for c in range(len(b.mean))]
@@ -305,12 +308,6 @@ def _kept(on: Stage, k: int, technique: Technique) -> float:
         return 0.0
     one, two = (on.integrator(half).gathering for half in technique.halves)
     return one.kept(two, k)
-
-
-def _of_blur(blurred: RadianceEstimate, b: RadianceEstimate) -> Number:
-    """An upper estimate of the squared bias of walks; where no sample shows any blurred light, by the rule of three."""
-    square, least = mean_square_of(blurred, b), 3 / (BLUR_SEEN * blurred.samples * blurred.mean.shape[1])
-    return Number(BLUR_EFFECT**2 * square.value, BLUR_EFFECT**2 * math.hypot(square.error, least**2))
 
 
 def training_seconds(scene: mi.Scene, object: str, model: str) -> float:
