@@ -304,7 +304,9 @@ class ObjectFit:
                     loss = likelihood((self._f(x[:, a], back), T[:, a]), (self._f(y[:, b], back), W[:, b]), kept)
                     loss = loss + mean_likelihood(self.modules["alpha"](exits[:, e]), T_alpha[:, e], self.alpha_scale)
                     if patch is not None and not back:
-                        loss = loss + self._patch_loss(x[:, a], T[:, a], patch[a])
+                        some = slice(i * batch, i * batch + min(batch, PATCH_BATCH))
+                        logits = self.modules["patches"](x[: self.n_side, some])
+                        loss = loss + patch_likelihood(logits, T[:, some].mean(dim=0), patch[some])
                     self._advance(loss, steps)
 
     def solve(self, source: PairSource, chunks: int, seed: int) -> None:
@@ -338,11 +340,6 @@ class ObjectFit:
             p = (value / (ENOUGH * value.mean().clamp_min(1e-30))).clamp(LEAST, 1.0)
             kept = torch.nonzero(self._tensor(order.random(len(p), np.float32)) < p)[:, 0]
             return y[:, kept], W[:, kept] * (len(kept) / len(p)) / p[kept]
-
-    def _patch_loss(self, x: torch.Tensor, T: torch.Tensor, patch: torch.Tensor) -> torch.Tensor:
-        """The loss of the logits of patches on a part of a batch."""
-        T = T[:, :PATCH_BATCH].mean(dim=0)
-        return patch_likelihood(self.modules["patches"](x[: self.n_side, :PATCH_BATCH]), T, patch[:PATCH_BATCH])
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The averaged numbers of all networks by name, and what is solved for beside them."""

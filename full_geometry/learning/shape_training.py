@@ -234,11 +234,6 @@ class _ShapeTraining:
         self.pool: list[GroupedPairs] = []
         self.seen: list[dict[str, Any]] = []
 
-    def claim(self) -> None:
-        """Say whose the folder of work is, or check it."""
-        if self.work:
-            claim(self.work, recipe=asdict(self.recipe), seed=self.seed, meshes=[m.name for m in self.meshes])
-
     def object(self, k: int) -> tuple[PairData | None, dict[str, Any]]:
         """Data and record of object k, from the folder of work if they are there."""
         place = self.work / f"object-{k:05d}.npz" if self.work else None
@@ -259,7 +254,8 @@ class _ShapeTraining:
     def go(
         self, folder: Path, seconds: float, plan: tuple[int, int] | None, progress: NamedProgress | None
     ) -> LearntShapes:
-        self.claim()
+        if self.work:
+            claim(self.work, recipe=asdict(self.recipe), seed=self.seed, meshes=[m.name for m in self.meshes])
         objects, steps = self._plan(seconds, plan)
         started = saved = time.monotonic()
         first = max(int(FIRST_SHARE * objects), 1)
@@ -267,7 +263,10 @@ class _ShapeTraining:
         if self.work and (self.work / CHECKPOINT).exists():
             done = self.fitting.load(self.work / CHECKPOINT)
         for k in range(objects):
-            self._take(k)
+            data, record = self.object(k)
+            self.seen.append(record)
+            if data is not None:
+                self.pool.append(grouped(data))
             if k + 1 >= max(first, done + 1) and self.pool:
                 self._fit(k, first, objects, steps)
                 if self.work and time.monotonic() - saved > CHECKPOINT_EVERY:
@@ -278,12 +277,6 @@ class _ShapeTraining:
                 progress("shapes" if k + 1 < first else "training", k + 1, objects)
         spent = time.monotonic() - started
         return LearntShapes(self.write(folder, steps, spent), len(self.pool), self.fitting.step, spent)
-
-    def _take(self, k: int) -> None:
-        data, record = self.object(k)
-        self.seen.append(record)
-        if data is not None:
-            self.pool.append(grouped(data))
 
     def _fit(self, k: int, first: int, objects: int, steps: int) -> None:
         """The steps between object k and the next one."""
