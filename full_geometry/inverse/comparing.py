@@ -20,12 +20,10 @@ of w in its second derivative.
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -37,8 +35,7 @@ from full_geometry.inverse.views import GivenView, edit
 from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.noise_free import NoiseFree
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.progress import ProgressText
-from halfspace_sss.provenance import provenance, write_atomically
+from halfspace_sss.provenance import provenance
 
 LOSSES = ("relative", "l2", "robust")
 LIGHTS = ("sampled", "precomputed")
@@ -479,26 +476,6 @@ def _root(losses: Sequence[tuple[float, float]]) -> NoiseFree:
     return NoiseFree(float(loss), float(np.sqrt(variance / len(losses))))
 
 
-class FitDescent(Protocol):
-    """Steps that bring a scene closer to images."""
-
-    comparison: ViewComparison
-    total: int
-    steps: list[FitStep]
-
-    def step(self, k: int) -> FitStep:
-        """Take step k."""
-
-    def state(self) -> dict[str, np.ndarray]:
-        """All that the next step depends on, but exposures and steps."""
-
-    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Go back to such a state."""
-
-    def fingerprint(self) -> str:
-        """A hash of what is fitted to what, how, and from where."""
-
-
 def kept_at(change: np.ndarray | float) -> np.ndarray | float:
     """Share that is kept of what was measured before a variable changed by so much."""
     return 1 / (1 + (change / FAR) ** 4)
@@ -519,39 +496,3 @@ def means_of_arrays(arrays: Mapping[str, np.ndarray], kind: Callable[..., Any]) 
             _, which, name = key.split()
             kept.setdefault(int(which), {})[name] = value if value.ndim else float(value)
     return {which: kind(**each) for which, each in kept.items()}
-
-
-def descend(descent: FitDescent, work: Path | None, progress: ProgressText | None) -> None:
-    """Take all steps that are left, kept in the folder `work`, from which the same fit goes on.
-    ValueError if `work` is that of another fit."""
-    path, of = work and work / "state.npz", descent.fingerprint()
-    if path is not None and path.exists():
-        _load(path, of, descent)
-    while (k := len(descent.steps)) < descent.total:
-        descent.steps.append(descent.step(k))
-        if path is not None:
-            _save(path, of, descent)
-        if progress:
-            progress(k + 1, descent.total, descent.steps[-1].line())
-
-
-def _save(path: Path, of: str, descent: FitDescent) -> None:
-    arrays = {"of": np.array(of), "steps": np.array(json.dumps(descent.steps))}
-    file = io.BytesIO()
-    shown = {f"shown {which}": image for which, image in descent.comparison.shown.items()}
-    np.savez(file, **arrays, factors=descent.comparison.factors, **shown, **descent.state())
-    write_atomically(path, file.getvalue())
-
-
-def _load(path: Path, of: str, descent: FitDescent) -> None:
-    try:
-        arrays = dict(np.load(path, allow_pickle=False))
-    except (OSError, ValueError, EOFError) as error:
-        raise ValueError(f"{path} must be the state of a fit, got {error}") from error
-    if str(arrays["of"]) != of:
-        raise ValueError(f"work must be a new folder or come from the same fit, got another one in {path.parent}")
-    descent.comparison.factors[:] = arrays.pop("factors")
-    for key in [key for key in arrays if key.startswith("shown ")]:
-        descent.comparison.shown[int(key.split()[1])] = arrays.pop(key)
-    descent.steps = [FitStep(*row) for row in json.loads(str(arrays["steps"]))]
-    descent.restore(arrays)

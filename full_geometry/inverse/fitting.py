@@ -14,6 +14,8 @@ logarithms, whose sum is 0: the derivatives of pixels by them are the image. Tex
 
 from __future__ import annotations
 
+import io
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,7 +37,6 @@ from full_geometry.inverse.comparing import (
     ViewComparison,
     ViewMisfit,
     arrays_of_means,
-    descend,
     kept_at,
     means_of_arrays,
 )
@@ -46,7 +47,7 @@ from full_geometry.scenes.scene_files import PATH_TRACED, open_scene
 from full_geometry.settings import check_variant
 from full_geometry.surface.wrapped import surface_of
 from halfspace_sss.progress import ProgressText
-from halfspace_sss.provenance import check_folder
+from halfspace_sss.provenance import check_folder, write_atomically
 
 STEPS = 30
 STEP = 0.15  # of variables, for differences
@@ -99,6 +100,42 @@ def fit(
         descent = MediumDescent(comparison, FitParameters.of(parameters, shape, mm_per_unit))
     descend(descent, work, progress)
     return descent.result()
+
+
+def descend(descent: MediumDescent | TextureDescent, work: Path | None, progress: ProgressText | None) -> None:
+    """Take all steps that are left, kept in the folder `work`, from which the same fit goes on.
+    ValueError if `work` is that of another fit."""
+    path, of = work and work / "state.npz", descent.fingerprint()
+    if path is not None and path.exists():
+        _load(path, of, descent)
+    while (k := len(descent.steps)) < descent.total:
+        descent.steps.append(descent.step(k))
+        if path is not None:
+            _save(path, of, descent)
+        if progress:
+            progress(k + 1, descent.total, descent.steps[-1].line())
+
+
+def _save(path: Path, of: str, descent: MediumDescent | TextureDescent) -> None:
+    arrays = {"of": np.array(of), "steps": np.array(json.dumps(descent.steps))}
+    file = io.BytesIO()
+    shown = {f"shown {which}": image for which, image in descent.comparison.shown.items()}
+    np.savez(file, **arrays, factors=descent.comparison.factors, **shown, **descent.state())
+    write_atomically(path, file.getvalue())
+
+
+def _load(path: Path, of: str, descent: MediumDescent | TextureDescent) -> None:
+    try:
+        arrays = dict(np.load(path, allow_pickle=False))
+    except (OSError, ValueError, EOFError) as error:
+        raise ValueError(f"{path} must be the state of a fit, got {error}") from error
+    if str(arrays["of"]) != of:
+        raise ValueError(f"work must be a new folder or come from the same fit, got another one in {path.parent}")
+    descent.comparison.factors[:] = arrays.pop("factors")
+    for key in [key for key in arrays if key.startswith("shown ")]:
+        descent.comparison.shown[int(key.split()[1])] = arrays.pop(key)
+    descent.steps = [FitStep(*row) for row in json.loads(str(arrays["steps"]))]
+    descent.restore(arrays)
 
 
 @dataclass(eq=False)
@@ -192,6 +229,7 @@ class MediumDescent:
         return self.comparison.fingerprint({name: _numbers(x).tolist() for name, x in self.parameters.start().items()})
 
     def state(self) -> dict[str, np.ndarray]:
+        """All that the next step depends on, but exposures and steps."""
         return {**arrays_of_means(self.means), **{f"x {name}": _numbers(x) for name, x in self.x.items()}}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
