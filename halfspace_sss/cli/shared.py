@@ -12,7 +12,7 @@ import time
 import typing
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -427,21 +427,15 @@ class Places:
         ),
     ] = None
 
-    @contextmanager
-    def executor(self) -> Iterator[Executor | None]:
+    def executor(self) -> AbstractContextManager[Executor | None]:
         """What runs the parts; None stands for this process."""
         from halfspace_sss import executors
 
         if self.workers is not None and self.scheduler is not None:
             raise ValueError(f"workers must be left out beside a scheduler, got {self.workers}")
         if self.scheduler is not None:
-            with executors.scheduler(self.scheduler, console().print) as result:
-                yield result
-        elif self.workers is not None:
-            with executors.workers(self.workers) as result:
-                yield result
-        else:
-            yield None
+            return executors.scheduler(self.scheduler, console().print)
+        return nullcontext() if self.workers is None else executors.workers(self.workers)
 
 
 def numbers(name: str, text: str) -> list[float]:
