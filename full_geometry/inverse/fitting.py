@@ -41,7 +41,7 @@ from full_geometry.inverse.comparing import (
     means_of_arrays,
 )
 from full_geometry.inverse.parameters import FitParameters, check_derivatives, translucent_object
-from full_geometry.inverse.textures import TextureDescent, TextureParameters
+from full_geometry.inverse.textures import TextureDescent, variables_of
 from full_geometry.inverse.views import GivenView, check_views
 from full_geometry.scenes.scene_files import PATH_TRACED, open_scene
 from full_geometry.settings import check_variant
@@ -95,7 +95,7 @@ def fit(
     work = None if work is None else check_folder(work)
     comparison, textured = ViewComparison(scene, list(images), settings), surface_of(shape).spec.textured is not None
     if textured:
-        descent = TextureDescent(comparison, TextureParameters.of(parameters, shape, mm_per_unit, scene))
+        descent = TextureDescent(comparison, shape, variables_of(parameters, shape, mm_per_unit, scene))
     else:
         descent = MediumDescent(comparison, FitParameters.of(parameters, shape, mm_per_unit))
     descend(descent, work, progress)

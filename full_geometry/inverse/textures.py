@@ -235,27 +235,18 @@ class Variable:
         return np.stack(numbers), np.stack(weights)
 
 
-@dataclass(frozen=True, eq=False)
-class TextureParameters:
-    """The textures and constants of one object that are fitted.
-    `variables`: textures and constants."""
-
-    shape: mi.Shape
-    variables: list[Variable]
-
-    @classmethod
-    def of(cls, names: Sequence[str], shape: mi.Shape, mm_per_unit: float, scene: mi.Scene) -> TextureParameters:
-        """Choose the parameters of an object by name.
-        ValueError if a name is unknown, there twice, or of another medium than the object's; a texture is neither a
-        bitmap nor an attribute of the mesh."""
-        textured = surface_of(shape).spec.textured
-        constants = [name for name in textured.constants if name != "sigma_t"]
-        lengths = ["sigma_t", "mfp"] if "sigma_t" in textured.constants else []
-        check_names(names, (*textured.textures, *constants, *lengths, "alpha"))
-        if "alpha" in names:
-            roughness(shape)
-        parameters = mi.traverse(scene)
-        return cls(shape, [_variable(name, shape, textured, mm_per_unit, parameters) for name in names])
+def variables_of(names: Sequence[str], shape: mi.Shape, mm_per_unit: float, scene: mi.Scene) -> list[Variable]:
+    """The textures and constants of an object by name.
+    ValueError if a name is unknown, there twice, or of another medium than the object's; a texture is neither a bitmap
+    nor an attribute of the mesh."""
+    textured = surface_of(shape).spec.textured
+    constants = [name for name in textured.constants if name != "sigma_t"]
+    lengths = ["sigma_t", "mfp"] if "sigma_t" in textured.constants else []
+    check_names(names, (*textured.textures, *constants, *lengths, "alpha"))
+    if "alpha" in names:
+        roughness(shape)
+    parameters = mi.traverse(scene)
+    return [_variable(name, shape, textured, mm_per_unit, parameters) for name in names]
 
 
 def _variable(
@@ -402,15 +393,14 @@ class Curvature:
 
 
 class TextureDescent:
-    """Gauss-Newton steps on textures and constants.
+    """Gauss-Newton steps on textures and constants of an object.
     `comparison`: of the scene with images."""
 
-    def __init__(self, comparison: ViewComparison, parameters: TextureParameters) -> None:
-        self.comparison, self.parameters = comparison, parameters
+    def __init__(self, comparison: ViewComparison, shape: mi.Shape, variables: list[Variable]) -> None:
+        self.comparison, self.shape, self.variables = comparison, shape, variables
         self.total = comparison.settings.steps or STEPS
         self.steps: list[FitStep] = []
         self.scene_parameters = mi.traverse(comparison.scene)
-        self.variables = parameters.variables
         self.ends = np.cumsum([v.start.size for v in self.variables])[:-1]
         self.x = np.concatenate([v.initial() for v in self.variables])
         self.means: dict[int, PixelMeans] = {}
@@ -479,7 +469,7 @@ class TextureDescent:
             self.scene_parameters[v.key] = v.numbers(x, change) if v.is_texture else followed[v.name]
         self.scene_parameters.update()
         # Differentiate by an even change of each texture, which the surface adds to what its texels show.
-        surface = surface_of(self.parameters.shape)
+        surface = surface_of(self.shape)
         textures = {FIELDS.get(v.name, v.name): followed[v.name] for v in self.variables if v.is_texture}
         surface.spec = surface.spec.with_variables(surface, **textures)
 
@@ -498,7 +488,7 @@ class TextureDescent:
             at, si, corner = self._points(which)
             for j, v in enumerate(self.variables):
                 # Add the weights of texels up over the rays of a pixel, and scale each row of D to the sum 1.
-                texels, weights = v.places(self.parameters.shape, si, corner)
+                texels, weights = v.places(self.shape, si, corner)
                 at_texels = np.tile(at, len(texels)), texels.ravel()
                 D = csr_array((weights.ravel(), at_texels), (height * width, v.texels))
                 D = diags_array(1 / np.maximum(D.sum(axis=1), 1e-30)) @ D
@@ -517,7 +507,7 @@ class TextureDescent:
         # Find the pixel of each ray; positions of a box filter lie on its lower edge, less rounding.
         column, row = (np.floor(np.array(p) + 1e-4).astype(int) - int(o) for p, o in zip(ray[2], film.crop_offset()))
         inside = (0 <= column) & (column < width) & (0 <= row) & (row < height)
-        on = met.is_valid() & (met.shape == mi.ShapePtr(self.parameters.shape)) & mi.Bool(inside)
+        on = met.is_valid() & (met.shape == mi.ShapePtr(self.shape)) & mi.Bool(inside)
         # Keep the rays that meet the object within the crop.
         kept = dr.compress(on)
         ray, met = (dr.gather(type(each), each, kept) for each in (mi.Ray3f(ray[0]), met))
@@ -586,8 +576,8 @@ class TextureDescent:
             [{name: each[j] for name, each in found.items() if each[0] == kind} for j in (1, 2)]
             for kind in (False, True)
         )
-        medium = surface_of(self.parameters.shape).spec
-        medium = medium.textured.mean(medium.medium.g, medium.medium.eta, self.parameters.shape)
+        medium = surface_of(self.shape).spec
+        medium = medium.textured.mean(medium.medium.g, medium.medium.eta, self.shape)
         exposures = self.comparison.exposures.tolist()
         return MaterialFit(
             values=values, errors=errors, correlation=np.zeros((0, 0)), medium=medium, misfit=fitted, held_out=held,

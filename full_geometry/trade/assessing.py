@@ -21,9 +21,9 @@ from full_geometry.learning.learners import Learner, learner
 from full_geometry.scenes.reference import check_sensor
 from full_geometry.scenes.scene_files import PATH_TRACED, first_cause
 from full_geometry.trade.denoised_walks import KNOWN as KNOWN_ERROR
-from full_geometry.trade.denoised_walks import DenoisingBudget, Walked, denoised_rows
+from full_geometry.trade.denoised_walks import Walked, denoised_rows
 from full_geometry.trade.images import with_flip
-from full_geometry.trade.measuring import RunBudget, SceneSamples, light_variance
+from full_geometry.trade.measuring import SceneSamples, light_variance
 from full_geometry.trade.results import Assessment, ObjectTrade, TechniqueTrade, samples_for
 from full_geometry.trade.sampling import Sampled
 from full_geometry.trade.statistics import joined
@@ -122,9 +122,8 @@ def assess_stage(
     """As `assess`, of a scene that is made ready, with the time shared by all techniques alike.
     Denoised walks have `denoising` seconds each, or end where the error² of the samples that keep the tolerance has the
     relative error `known`."""
-    samples = SceneSamples.of(on, chosen, effort)
-    budget = RunBudget(effort.seconds, effort.samples)
-    samples.run([t for t in chosen if not t.denoised], budget, seeded(effort.seed, 42), progress)
+    samples = SceneSamples.of(on, chosen, effort, progress)
+    samples.run([t for t in chosen if not t.denoised], seeded(effort.seed, 42), effort.seconds, effort.samples)
     seconds = DENOISED_SHARE * effort.seconds if denoising is None else denoising
     _denoise(samples, chosen, seconds, tolerance, True, known)
     return samples.assessment()
@@ -141,18 +140,18 @@ def assess_for(
     later = [t for t in chosen if not every and (t.gathers or t.model in dear)]
     ahead = [t for t in chosen if t not in later and not t.denoised]
     exits = effort.exits if every else min(effort.exits, MOST)
-    samples = SceneSamples.of(on, ahead, replace(effort, exits=exits))
+    samples = SceneSamples.of(on, ahead, replace(effort, exits=exits), progress)
 
-    def run(chosen: Sequence[Technique], number: int, budget: RunBudget | None = None) -> None:
-        samples.run(chosen, budget or RunBudget(), seeded(effort.seed, number), progress)
+    def run(chosen: Sequence[Technique], number: int, seconds: float = 0.0) -> None:
+        samples.run(chosen, seeded(effort.seed, number), seconds)
 
     # Run walks twice, as the first launch tells little of time.
     run(walks := [t for t in ahead if t.walks], 46)
-    run(walks, 44, RunBudget(len(walks) * WALKED_FIRST))
+    run(walks, 44, len(walks) * WALKED_FIRST)
     _denoise(samples, chosen, DENOISED_SHARE * effort.seconds, job.tolerance, every)
     out: dict[Technique, str] = {}
     if every:
-        run(ahead, 42, RunBudget(FIRST_SHARE * effort.seconds))
+        run(ahead, 42, FIRST_SHARE * effort.seconds)
     else:
         out = _look_at_models(samples, chosen, ahead, later, job, run)
         ahead, later = ([t for t in some if t not in out] for some in (ahead, later))
@@ -175,7 +174,7 @@ def assess_for(
     reserve = sum(making_seconds(first.objects[k], gathering) for k in seen) / len(seen) if gathering else 0.0
     known, alone = 0.0 if every else KNOWN * job.tolerance**2, not every and not gathering and len(few) == 1
     left = max(left_of(first) - reserve, LEAST_SHARE * effort.seconds)
-    _go_on(samples, first, few, left, None if alone else known, seeded(effort.seed, 71), progress)
+    _go_on(samples, first, few, left, None if alone else known, seeded(effort.seed, 71))
     # Gather the light of the most promising technique, or of the next one if the scene refuses it.
     again = samples.assessment()
     few, gathering, reasons = look(again)
@@ -185,7 +184,7 @@ def assess_for(
         if not all(again.objects[k].way(gathering.name).refusal for k in seen):
             few.append(gathering)
             left = max(left_of(again), LAST_SHARE * effort.seconds)
-            _go_on(samples, again, few, left, known, seeded(effort.seed, 73), progress)
+            _go_on(samples, again, few, left, known, seeded(effort.seed, 73))
             again = samples.assessment()
             break
         later = [t for t in later if t != gathering]
@@ -220,9 +219,8 @@ def _with_reasons(assessed: Assessment, out: dict[Technique, str]) -> Assessment
 
 
 def _go_on(
-    samples: SceneSamples, assessed: Assessment, few: Sequence[Technique], left: float, known: float | None, seed: int,
-    progress: NamedProgress | None,
-) -> None:  # fmt: skip
+    samples: SceneSamples, assessed: Assessment, few: Sequence[Technique], left: float, known: float | None, seed: int
+) -> None:
     """Run some techniques further, for the seconds that are left or until each bias² has the standard error `known`.
     With V t of a technique, the noise of all biases is least where its share of the time is sqrt(V t) over the sum of
     these. Walks are compared with all n others, so that their V t counts n times."""
@@ -238,7 +236,7 @@ def _go_on(
     for technique in few:
         seconds = min(left * parts[technique] / whole, enough[technique])
         if seconds > 0:
-            samples.run([technique], RunBudget(seconds), seeded(seed, few.index(technique)), progress)
+            samples.run([technique], seeded(seed, few.index(technique)), seconds)
 
 
 def _denoise(
@@ -268,13 +266,12 @@ def _denoise(
         if reason:
             samples.denoised[technique] = [TechniqueTrade(technique.name, refusal=reason)] * len(found)
             continue
-        sensor, seed = samples.effort.sensor, samples.effort.seed
         known = [
             _walked(samples.on, samples.sampled[k][plain[technique]], o, rows[k]) if k in rows else None
             for k, o in enumerate(found)
         ]
-        budget = DenoisingBudget(seconds, tolerance, sensor, seed, error)
-        samples.denoised[technique] = denoised_rows(samples.on, technique, known, budget)
+        effort = samples.effort
+        samples.denoised[technique] = denoised_rows(samples.on, technique, known, effort, seconds, tolerance, error)
 
 
 def _walked(on: Stage, sampled: list[Sampled], assessed: ObjectTrade, row: TechniqueTrade) -> Walked:

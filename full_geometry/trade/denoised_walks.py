@@ -37,7 +37,7 @@ from full_geometry.trade.denoising import GUIDE_SPP, GUIDES, denoised, guides_of
 from full_geometry.trade.images import film_of, pixel_means, pixels_of
 from full_geometry.trade.results import DOUBT, TechniqueTrade
 from full_geometry.trade.statistics import Number
-from full_geometry.trade.techniques import Stage, Technique
+from full_geometry.trade.techniques import Effort, Stage, Technique
 from halfspace_sss.backend import clock
 
 SIDE, MARGIN = 24, 4  # of a tile, pixels; beside the margin errors of a whole image are the same
@@ -82,53 +82,44 @@ class Walked(NamedTuple):
         return max(self.row.variance - self.light.value, 1e-12)
 
 
-class DenoisingBudget(NamedTuple):
-    """What denoised walks are measured by: seconds for all objects, the tolerance if there is one, sensor and seed, and
-    the relative error of e² that ends it."""
-
-    seconds: float
-    tolerance: float | None
-    sensor: int
-    seed: int
-    known: float = KNOWN
-
-
 def denoised_rows(
-    on: Stage, technique: Technique, found: Sequence[Walked | None], budget: DenoisingBudget
-) -> list[TechniqueTrade | None]:
+    on: Stage, technique: Technique, found: Sequence[Walked | None], effort: Effort, seconds: float,
+    tolerance: float | None, enough: float,
+) -> list[TechniqueTrade | None]:  # fmt: skip
     """What denoised walks are worth on each object: rows whose variance falls by a power of their samples, as it is
     where they keep the tolerance. `technique`: denoised walks. `found`: of the same walks as they are; None for an
-    object that is not seen."""
+    object that is not seen. `seconds`: for all objects. `enough`: relative error of e² that ends it where there is a
+    tolerance."""
     # ---- tiles of the image, as many as leave each the samples that are wanted
     started = clock()
-    camera = on.scene.sensors()[budget.sensor]
+    camera, seed = on.scene.sensors()[effort.sensor], effort.seed
     film = tuple(int(n) for n in camera.film().crop_size())
     seen, halves = [k for k, each in enumerate(found) if each], (technique.halves[0], technique.halves[-1])
     of_tile = 2 * SIDE**2 * max(found[k].pace for k in seen)
-    number = int(np.clip(budget.seconds / (WANTED * of_tile), *TILES))
+    number = int(np.clip(seconds / (WANTED * of_tile), *TILES))
     limits = np.max([found[k].limits for k in seen], axis=0)
-    places = _places(on, halves[0], camera, film, limits, budget.seed)
-    tiles = Tiles.of(on, camera, film, [places[seen[k % len(seen)]] for k in range(number)], budget.seed)
+    places = _places(on, halves[0], camera, film, limits, seed)
+    tiles = Tiles.of(on, camera, film, [places[seen[k % len(seen)]] for k in range(number)], seed)
 
     # ---- samples of both halves, until errors are known or the time is over
-    expected = seconds = 2 * PASSES * sum(float(tiles.seen[k]) * found[k].pace for k in seen)  # of a sample of all
+    expected = each = 2 * PASSES * sum(float(tiles.seen[k]) * found[k].pace for k in seen)  # seconds of a sample of all
     spp = 0
     while True:
-        left = int((budget.seconds + started - clock()) / seconds)
+        left = int((seconds + started - clock()) / each)
         more = min(left, FURTHER * spp) if spp else max(int(FIRST * left), 1)
         if more < max(spp / 2, 1):
             break
         began = clock()
         for half, part in enumerate(halves):
-            number = seeded(budget.seed, 62, half, spp)
+            number = seeded(seed, 62, half, spp)
             passes = _passes(on, part, camera, film, tiles.pixels, limits, (PASSES, more, number))
             tiles.take(half, passes, spp, more)
-        spp, seconds = spp + more, (clock() - began) / more
+        spp, each = spp + more, (clock() - began) / more
         tiles.denoise(spp)
         laws = {k: _law(tiles, k, found[k]) for k in seen}
-        ends = [laws[k].end(found[k].row, budget.tolerance, PASSES * spp) for k in seen]
+        ends = [laws[k].end(found[k].row, tolerance, PASSES * spp) for k in seen]
         alone = [laws[k].denoised(n) for k, n in zip(seen, ends)]
-        if budget.tolerance and all(e.error <= budget.known * e.value for e in alone):
+        if tolerance and all(e.error <= enough * e.value for e in alone):
             break
 
     # ---- the law of each object about the samples that keep the tolerance
@@ -138,7 +129,7 @@ def denoised_rows(
     rows: list[TechniqueTrade | None] = [None] * len(found)
     for k, n in zip(seen, ends):
         plain, e = found[k].row, laws[k].at(n)
-        pace = plain.seconds + (seconds / expected - 1) * found[k].pace
+        pace = plain.seconds + (each / expected - 1) * found[k].pace
         power = float(np.clip(math.log(e.value / laws[k].at(2 * n).value) / math.log(2), 0.05, 2.0))
         rows[k] = replace(
             plain, way=technique.name, variance=e.value * n**power, variance_error=e.error * n**power, power=power,

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import mitsuba as mi
 import numpy as np
@@ -64,14 +63,6 @@ GATHERED_SHARE = 0.2  # most of the time for samples of gathered light: sqrt(V t
 Samples = dict[Technique, "list[Sampled] | str"]  # of an object by each technique, or why it refuses the object
 
 
-class RunBudget(NamedTuple):
-    """The time or samples that a run of several techniques may take.
-    `seconds`: for each object; with 0 the first samples are all. `samples`: of each exit, instead."""
-
-    seconds: float = 0.0
-    samples: int | None = None
-
-
 @dataclass(eq=False)
 class SceneSamples:
     """The samples that have been taken of the objects of a scene.
@@ -86,6 +77,7 @@ class SceneSamples:
 
     on: Stage
     effort: Effort
+    progress: NamedProgress | None
     started: float
     points: list[Exits | None]
     sampled: list[Samples]
@@ -95,7 +87,7 @@ class SceneSamples:
     _training: dict[tuple[int, str], float] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, on: Stage, chosen: Sequence[Technique], effort: Effort) -> SceneSamples:
+    def of(cls, on: Stage, chosen: Sequence[Technique], effort: Effort, progress: NamedProgress | None) -> SceneSamples:
         """No samples yet, at exits of all objects, with kernels ready for what techniques have in common."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # they are heard when the techniques are made ready again
@@ -104,32 +96,28 @@ class SceneSamples:
         started = clock()
         seen = visible_exits(on.scene, on.shapes, effort.sensor, effort.exits, seeded(effort.seed, 41))
         mfp = [_mfp(on, k) for k in range(len(seen))]
-        return cls(on, effort, started, seen, [{} for _ in seen], [[] for _ in seen], mfp)
+        return cls(on, effort, progress, started, seen, [{} for _ in seen], [[] for _ in seen], mfp)
 
-    def run(self, chosen: Sequence[Technique], budget: RunBudget, seed: int, progress: NamedProgress | None) -> None:
-        """Sample all objects by some techniques, or go on with them."""
+    def run(self, chosen: Sequence[Technique], seed: int, seconds: float = 0.0, samples: int | None = None) -> None:
+        """Sample all objects by some techniques, or go on with them.
+        `seconds`: for each object; with 0 the first samples are all. `samples`: of each exit, instead."""
         for k, points in enumerate(self.points):
-
-            def tell(name: str, done: int, k: int = k) -> None:
-                if progress:
-                    progress(f"{self.on.names[k]}, {name}", k * len(chosen) + done, len(self.points) * len(chosen))
-
             if points is not None:
                 with warnings.catch_warnings(record=True) as caught:
                     warnings.simplefilter("always")
-                    self._run_object(k, points, chosen, budget, seeded(seed, k), tell)
+                    self._run_object(k, points, chosen, seconds, samples, seeded(seed, k))
                     self.heard[k] += [" ".join(str(w.message).split()) for w in caught]
 
     def _run_object(
-        self, k: int, points: Exits, chosen: Sequence[Technique], budget: RunBudget, seed: int,
-        tell: Callable[[str, int], None],
-    ) -> None:  # fmt: skip
-        on, sampled = self.on, self.sampled[k]
-        samples, end = budget.samples, clock() + budget.seconds
+        self, k: int, points: Exits, chosen: Sequence[Technique], seconds: float, samples: int | None, seed: int
+    ) -> None:
+        on, sampled, end = self.on, self.sampled[k], clock() + seconds
         ordered = sorted(chosen, key=lambda each: not each.gathers)  # the others share what gathered light leaves
         sampled |= {technique: [] for technique in chosen if technique not in sampled}
         for done, technique in enumerate(ordered):
-            tell(technique.name, done)
+            if self.progress:
+                whole = len(self.points) * len(chosen)
+                self.progress(f"{on.names[k]}, {technique.name}", k * len(chosen) + done, whole)
             if isinstance(sampled[technique], str):
                 continue
             share = TRACED_SHARE if technique.exact and len(chosen) > 1 else 1 / (len(chosen) - done)

@@ -18,7 +18,7 @@ import drjit as dr  # noqa: E402
 from figures import app as cli  # noqa: E402
 from full_geometry import inverse  # noqa: E402
 from full_geometry.inverse.comparing import ViewComparison  # noqa: E402
-from full_geometry.inverse.textures import TextureDescent, TextureParameters  # noqa: E402
+from full_geometry.inverse.textures import TextureDescent, variables_of  # noqa: E402
 from full_geometry.inverse.views import GivenView, read_views  # noqa: E402
 from full_geometry.scenes.scene_files import open_scene  # noqa: E402
 from full_geometry.surface.wrapped import surface_of  # noqa: E402
@@ -99,7 +99,7 @@ def test_pixels_know_the_texels_that_they_show(tmp_path: Path, kind: str) -> Non
         mesh.update()
     view = GivenView.of("a", 0, np.ones((12, 12, 3), np.float32))
     comparison = ViewComparison(scene, [view], inverse.FitSettings())
-    descent = TextureDescent(comparison, TextureParameters.of(["albedo"], shape, 1.0, scene))
+    descent = TextureDescent(comparison, shape, variables_of(["albedo"], shape, 1.0, scene))
     at, si, _ = descent._points(0)
     seen = np.array(surface_of(shape).spec.textured.textures["albedo"].eval(si))
     wanted = np.stack([np.bincount(at, c, 144) / np.maximum(np.bincount(at, minlength=144), 1) for c in seen], axis=1)
