@@ -14,6 +14,7 @@ import typer
 
 from full_geometry.cli.variants import Drawers, Variant, use_mitsuba
 from halfspace_sss.cli import shared
+from halfspace_sss.provenance import check_folder, provenance, write_together
 
 if TYPE_CHECKING:
     from full_geometry.inverse.comparing import MaterialFit
@@ -75,7 +76,6 @@ def fit(
     """
     use_mitsuba(variant)
     from full_geometry import inverse
-    from halfspace_sss.provenance import check_folder
 
     settings = inverse.FitSettings(**vars(descent))
     check_folder(out)
@@ -95,7 +95,6 @@ def _write(found: MaterialFit, scene: Path, name: str | None, out: Path, drawers
     """Write the files of a fit: numbers, then textures and the scene, then the page; their paths."""
     from halfspace_sss.materials.catalogue import to_toml
     from halfspace_sss.materials.material import Material
-    from halfspace_sss.provenance import provenance, write_together
 
     stem = f"{scene.stem}_fit"
     told = provenance(**{key: value.tolist() for key, value in found.values.items()})

@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from full_geometry.cli.variants import Drawers, SceneOptions, use_mitsuba
+from halfspace_sss.backend import BackendError
 from halfspace_sss.cli import shared
 from halfspace_sss.interrupts import interrupts
+from halfspace_sss.provenance import check_folder, one_writer, replace_together, write_atomically
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -127,7 +129,6 @@ def render(
     from full_geometry.integrators.bssrdf import is_bssrdf
     from full_geometry.scenes.reference import LARGEST_PASS, chosen
     from full_geometry.viewing.frames import read_rows
-    from halfspace_sss.provenance import check_folder
 
     until.limits()  # refuses what is out of range, before any work
     drawers, rows = _drawers(context, images.denoise), read_rows(images.frames) if images.frames else None
@@ -163,7 +164,6 @@ def _image(
     from full_geometry.scenes.reference import cross_denoised
     from full_geometry.scenes.reference_store import Picture
     from full_geometry.trade.denoising import Denoiser
-    from halfspace_sss.provenance import one_writer
 
     with one_writer(file):
         if images.frames and images.resume and _is_finished(way, file, which):
@@ -296,8 +296,6 @@ def _sensors(text: str, scene: mi.Scene) -> list[int]:
 
 def _drawers(context: typer.Context, denoise: bool) -> Drawers | None:
     """What draws the page and denoises, if it is there; BackendError before anything is rendered in vain."""
-    from halfspace_sss.backend import BackendError
-
     drawers = context.find_object(Drawers)
     if denoise and (drawers is None or find_spec("mitsuba_oidn") is None):
         raise BackendError('denoising needs mitsuba-oidn and a page: pip install "halfspace-sss[figures]"')
@@ -312,7 +310,6 @@ def _rendered(scene: mi.Scene, file: Path, limits: Limits, which: dict[str, Any]
     """The render, in files of another name until it is done."""
     from full_geometry.learning import online
     from full_geometry.scenes.scene_files import first_cause
-    from halfspace_sss.backend import BackendError
 
     part, bars = _unfinished(file), _Bars(limits)
     begun = any(path.exists() for path in (part, *online.files(part).values()))
@@ -373,8 +370,6 @@ class _Bars:
 
 def _publish(picture: Picture, file: Path, drawn: dict[str, bytes]) -> list[Path]:
     """Put the finished files in the place of those of before, all of one render at any moment; their paths."""
-    from halfspace_sss.provenance import replace_together, write_atomically
-
     part = _unfinished(file)
     drawn = {"png": picture.png(), **drawn}
     for ending, data in drawn.items():

@@ -11,6 +11,8 @@ import typer
 
 from full_geometry.cli.variants import Drawers, SceneOptions, use_mitsuba
 from halfspace_sss.cli import shared
+from halfspace_sss.noise_free import NoiseFree
+from halfspace_sss.provenance import check_folder, provenance, write_together
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -66,7 +68,6 @@ def trade(
 ) -> None:
     """Measure speed against accuracy: a table, a recommendation, CSV, JSON, and the figure and page of a scene."""
     from halfspace_sss.checks import check_count, check_interval
-    from halfspace_sss.provenance import check_folder
 
     check_interval("tolerance", wanted.tolerance, 1e-4, 1.0)  # 5 is meant as 5 %
     check_count("images", wanted.images, 1)
@@ -102,8 +103,6 @@ def _shipped() -> None:
 
     import pandas
 
-    from halfspace_sss.noise_free import NoiseFree
-
     with resources.as_file(resources.files("full_geometry.trade").joinpath("data", SHIPPED)) as path:
         rows = list(pandas.read_csv(path).itertuples())
     cells = []
@@ -118,7 +117,6 @@ def _shipped() -> None:
 def _material(name: str, how: dict[str, Any], out: Path) -> None:
     from full_geometry.trade.advice import recommend_flat
     from halfspace_sss import materials
-    from halfspace_sss.provenance import provenance, write_together
 
     result = recommend_flat(materials.load(name).medium, **how)
     about = {"provenance": provenance(material=name, **how), **result.record()}
@@ -136,7 +134,6 @@ def _scene(
     from full_geometry.trade.assessing import assess
     from full_geometry.trade.images import picture_of
     from full_geometry.trade.techniques import Job, techniques
-    from halfspace_sss.provenance import provenance, write_together
 
     job, limits = Job(**asdict(wanted)), {"tolerance": wanted.tolerance, "images": wanted.images}
     if every and how["models"] is None:

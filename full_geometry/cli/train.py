@@ -13,6 +13,7 @@ from full_geometry.cli.variants import SceneOptions, use_mitsuba
 from halfspace_sss.cli import shared
 from halfspace_sss.cli.errors import write_errors
 from halfspace_sss.cli.train import ResultOptions, Work, need_torch
+from halfspace_sss.provenance import check_folder
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -128,8 +129,6 @@ def errors_object(
     out: shared.OutFolder = Path("errors"),
 ) -> None:
     """Compare models of an object of a scene with walks: radiance of random exits; written as CSV and JSON."""
-    from halfspace_sss.provenance import check_folder
-
     parameters = on.parameters()
     check_folder(out)
     use_mitsuba(on.variant)

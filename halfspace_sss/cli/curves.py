@@ -12,13 +12,13 @@ import typer
 
 from halfspace_sss.cli import shared
 from halfspace_sss.cli.shared import AsJson, OneMaterial, say, table
+from halfspace_sss.provenance import JsonDict, check_folder
 
 if TYPE_CHECKING:
     import pandas
     from rich.table import Table
 
     from halfspace_sss.comparison.curve_set import CurveSet
-    from halfspace_sss.provenance import JsonDict
 
 NUMBERS = ("sigma_s", "sigma_a", "sigma_t", "albedo", "g", "eta", "sigma_s_prime", "albedo_prime")
 
@@ -150,7 +150,6 @@ def curves(
 ) -> None:
     """Compare curves of S, path traced and by every model; without arguments the setting of Fig. 10."""
     from halfspace_sss.comparison import reflectance_curves
-    from halfspace_sss.provenance import check_folder
 
     check_folder(out)
     medium = stated.stated([] if material is None else [material]) or material or "fig10"

@@ -12,8 +12,19 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from halfspace_sss.backend import array_types
 from halfspace_sss.cli import shared
 from halfspace_sss.cli.shared import Bar, Seed, csv_of, say, table
+from halfspace_sss.noise_free import NoiseFree
+from halfspace_sss.provenance import (
+    JsonDict,
+    KeptRows,
+    check_folder,
+    provenance,
+    without_nan,
+    write_atomically,
+    write_together,
+)
 
 if TYPE_CHECKING:
     import pandas
@@ -21,7 +32,6 @@ if TYPE_CHECKING:
 
     from halfspace_sss.comparison.truths import Comparison, Truth, Validation
     from halfspace_sss.physics.medium import Medium
-    from halfspace_sss.provenance import JsonDict
 
 SQUARE = ("error_square", "error_square_standard_error")  # what a printed error is made of
 DEFINITION = (
@@ -67,10 +77,8 @@ def errors_materials(
     out: shared.OutFolder = Path("errors"),
 ) -> None:
     """Compare models with path tracing over all directions: error, bias, decades of r; written as CSV and JSON."""
-    from halfspace_sss.backend import array_types
     from halfspace_sss.checks import check_interval
     from halfspace_sss.comparison import model_errors
-    from halfspace_sss.provenance import check_folder
 
     media = _media(stated, material or [], channel, many, traced.seed)
     block, n = int(traced.block), len(media)
@@ -97,7 +105,6 @@ def errors_materials(
 def errors_truths(model: shared.Models = None, out: shared.OutFolder = Path("errors")) -> None:
     """Compare reflectances of models with published and exact values; an interrupted run goes on."""
     from halfspace_sss.comparison.model_truths import reflectance_truths, truth_summary
-    from halfspace_sss.provenance import KeptRows, check_folder, write_atomically
 
     check_models(model)
     check_folder(out)
@@ -166,8 +173,6 @@ def write_errors(
     out: Path, found: pandas.DataFrame, summary: pandas.DataFrame, definition: str, how: Mapping[str, object]
 ) -> list[Path]:
     """Write errors.csv and errors.json, with what an error is and how it was measured; the paths."""
-    from halfspace_sss.provenance import provenance, write_together
-
     content = {"provenance": provenance(**how), "definition": definition}
     content["summary"] = json.loads(summary.to_json(orient="records"))
     files = {out / "errors.csv": shared.csv_of(found), out / "errors.json": json.dumps(content, indent=1)}
@@ -202,8 +207,6 @@ def _table(frame: pandas.DataFrame, title: str) -> Table:
 
 def told_error(row: Mapping[str, float]) -> str:
     """An error with its standard error, or what it is below."""
-    from halfspace_sss.noise_free import NoiseFree
-
     return NoiseFree(*(row[name] for name in SQUARE)).told()
 
 
@@ -273,7 +276,6 @@ def write_results(result: Validation, folder: Path) -> None:
     import pandas
 
     from halfspace_sss.comparison.truths import Z_LIMIT
-    from halfspace_sss.provenance import provenance, without_nan, write_together
 
     records = [_record(c) for c in result.comparisons]
     content = {
@@ -296,7 +298,6 @@ def validate(
 ) -> None:
     """Trace every published, third-party or exact half-space number of the packaged table and compare."""
     from halfspace_sss.comparison import truths
-    from halfspace_sss.provenance import check_folder
 
     if out is not None:
         check_folder(out)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 import typer
 
 from halfspace_sss.cli import shared
+from halfspace_sss.provenance import check_folder, path_of
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -21,12 +22,6 @@ if TYPE_CHECKING:
     from halfspace_sss.physics.medium import Medium
 
 TARGET_ERROR = 0.05
-
-
-def _path(text: str | Path) -> Path:
-    from halfspace_sss.provenance import path_of
-
-    return path_of(text)
 
 
 @dataclass(frozen=True)
@@ -62,14 +57,13 @@ def maps(
         Path,
         typer.Option(
             help="Folder of the stores, or a URL as s3://BUCKET/maps; a run with the same options is continued.",
-            parser=_path,
+            parser=path_of,
             metavar="FOLDER",
         ),
     ] = Path("maps"),
 ) -> None:
     """Trace training maps into Zarr stores; an interrupted run goes on when it is started again."""
     from halfspace_sss.maps.map_store import make_maps
-    from halfspace_sss.provenance import check_folder
 
     media = stated.media(material or [], channel)
     if name is not None and "medium" not in media:
