@@ -11,9 +11,9 @@ cells of the size h lists for each cell all points that some place in it can rea
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -33,9 +33,6 @@ from full_geometry.geometry.points import (
 )
 from full_geometry.geometry.shape import Geometry
 from halfspace_sss.arrays import aligned
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
 
 PLACES = 2**17  # that must have a point in reach
 LOOKS = (23, 24)  # seeds of such places

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from copy import copy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 from weakref import WeakKeyDictionary
 
 import drjit as dr
@@ -30,9 +30,7 @@ from full_geometry.geometry import mesh
 from full_geometry.geometry.rounding import ray_from
 from full_geometry.geometry.shape import Geometry
 from halfspace_sss.arrays import aligned
-
-if TYPE_CHECKING:
-    from halfspace_sss.interface.model import BSSRDF
+from halfspace_sss.interface.model import BSSRDF
 
 
 @dataclass

@@ -21,7 +21,6 @@ thin, and C beyond its second degree in w_o, or the third of its cosine.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -39,6 +38,7 @@ from full_geometry.objects.objects import TranslucentObject
 from full_geometry.precomputed.lit_points import R_4, entries, to_world
 from full_geometry.precomputed.surface_regression import ResidualSums, directional, levels, smooth_field
 from full_geometry.precomputed.transport_matrix import Albedo, bent, count_of
+from full_geometry.settings import Settings
 from full_geometry.surface.varying import equivalent
 from full_geometry.surface.wrapped import surface_of
 from full_geometry.transport.models import lookup
@@ -46,9 +46,6 @@ from full_geometry.walk.media import WalkMedia, sent_back
 from full_geometry.walk.random_walk import PATH_LANES
 from halfspace_sss.backend import clock
 from halfspace_sss.interrupts import checkpoint
-
-if TYPE_CHECKING:
-    from full_geometry.settings import Settings
 
 PER_LAUNCH = 2**16  # walks
 FEWEST, MOST = 2**17, 2**22  # walks of an object

@@ -19,20 +19,18 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.geometry.instances import InstanceScene
 from full_geometry.geometry.light_points import lattice, uniform_entries
 from full_geometry.geometry.points import floats, place, turned
 from full_geometry.geometry.rounding import blocked
+from full_geometry.objects.objects import TranslucentObject
 from full_geometry.precomputed.transport_matrix import Incident, TransportMatrix, bent, cosine
-
-if TYPE_CHECKING:
-    from full_geometry.geometry.instances import InstanceScene
-    from full_geometry.objects.objects import TranslucentObject
 
 COUNT = 2**18  # places, and rays of an emitter
 KINDS = ("SpotLight", "Projector")

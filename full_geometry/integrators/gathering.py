@@ -13,22 +13,25 @@ detail of light below the distance of the points (`fine_light` keeps its flux). 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.geometry.instances import InstanceScene
 from full_geometry.geometry.light_points import GOLDEN, SurfacePoints
-from full_geometry.geometry.points import cosine_above, floats, of_rows, opaque, place, surface_point
+from full_geometry.geometry.points import SurfacePoint, cosine_above, floats, of_rows, opaque, place, surface_point
 from full_geometry.geometry.rounding import blocked, ray_from
 from full_geometry.geometry.snapshot import Snapshot, same_objects
 from full_geometry.integrators.fine_light import fine_light
 from full_geometry.integrators.inner_light import COUNT, inner_light
 from full_geometry.integrators.lighting import EnvironmentMean, Lights
 from full_geometry.integrators.surface_paths import trace_paths
+from full_geometry.objects.objects import TranslucentObject
 from full_geometry.precomputed.inner import Events, InnerLight, has_inner_light
 from full_geometry.precomputed.point_pairs import Rays
 from full_geometry.precomputed.surface_regression import TERMS, directional
@@ -42,18 +45,11 @@ from full_geometry.precomputed.transport_matrix import (
     cosine,
     transport_matrix,
 )
+from full_geometry.settings import Settings
 from full_geometry.walk.emission import emitter_pdf, mis_weight, sample_emitter
 from full_geometry.walk.media import WalkMedia, sent_back
 from halfspace_sss.backend import clock
 from halfspace_sss.interrupts import checkpoint
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from full_geometry.geometry.instances import InstanceScene
-    from full_geometry.geometry.points import SurfacePoint
-    from full_geometry.objects.objects import TranslucentObject
-    from full_geometry.settings import Settings
 
 DIRECTIONS = 2**18  # of all points of an object, by emitters, and as many by the cosine
 FEWEST, MOST = 24, 1024  # of a point

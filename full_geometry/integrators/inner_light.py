@@ -8,24 +8,20 @@ boundary: so its bright parts are found without a search.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.geometry.light_points import SurfacePoints
 from full_geometry.geometry.points import opaque, place, wrapped
 from full_geometry.geometry.rounding import ray_from
 from full_geometry.geometry.sensors import independent
 from full_geometry.integrators.ballistic_and_single import OneEventWalk, light_at_events
 from full_geometry.integrators.lighting import Primal, RenderContext
+from full_geometry.objects.objects import TranslucentObject
 from full_geometry.precomputed.inner import Events, InnerLight, bands
 from full_geometry.precomputed.transport_matrix import R_2
-
-if TYPE_CHECKING:
-    from full_geometry.geometry.light_points import SurfacePoints
-    from full_geometry.objects.objects import TranslucentObject
-    from full_geometry.settings import Settings
+from full_geometry.settings import Settings
 
 COUNT = 2**17  # events
 BRIGHTEST = 1 / 8192  # of the events, which are as bright as the next at most

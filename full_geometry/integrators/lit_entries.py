@@ -13,25 +13,20 @@ e is used where it pays: where the mean of e² over the area is `LEAST_GAIN` tim
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from full_geometry.geometry.light_points import SurfacePoints, uniform_entries
-from full_geometry.geometry.points import AreaPoints
+from full_geometry.geometry.points import AreaPoints, Proposals
 from full_geometry.geometry.sensors import independent
 from full_geometry.geometry.shape import Geometry
 from full_geometry.geometry.snapshot import Snapshot, same_objects
 from full_geometry.integrators.gathering import GatheringPoint, by_emitters, light_state, met_by_cosine, spreads
 from full_geometry.integrators.lighting import Primal, RenderContext
+from full_geometry.objects.objects import TranslucentObject
 from full_geometry.precomputed.transport_matrix import Albedo
-
-if TYPE_CHECKING:
-    from full_geometry.geometry.points import Proposals
-    from full_geometry.objects.objects import TranslucentObject
-    from full_geometry.settings import Settings
+from full_geometry.settings import Settings
 
 CELLS = 1024  # of a mesh of many faces:
 FACES = 4  # for each cell, from which on none is divided

@@ -9,12 +9,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
+import mitsuba as mi
 import numpy as np
 
+from full_geometry.geometry.points import Transport
 from full_geometry.learning.model_errors import RadianceError, errors_of, transport_of
 from full_geometry.objects.objects import TranslucentObject, object_of, outermost
+from full_geometry.scenes.camera_walks import CameraWalks
 from full_geometry.surface.wrapped import surface_of
 from full_geometry.transport.models import model_names
 from full_geometry.transport.storing import KIND, find_weights, trained
@@ -25,12 +28,6 @@ from halfspace_sss.lazy import once
 from halfspace_sss.neural.store import check_weights_folder, load_weights
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.registry import models as half_space_models
-
-if TYPE_CHECKING:
-    import mitsuba as mi
-
-    from full_geometry.geometry.points import Transport
-    from full_geometry.scenes.camera_walks import CameraWalks
 
 
 class ObjectError(NamedTuple):

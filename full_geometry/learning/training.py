@@ -10,7 +10,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -18,6 +18,7 @@ import numpy as np
 
 from full_geometry.geometry import mesh
 from full_geometry.geometry.points import SurfacePoint, evaluate
+from full_geometry.integrators.walk_paths import FirstExits
 from full_geometry.learning.model_errors import (
     ExitRadiance,
     ExitTruth,
@@ -44,9 +45,6 @@ from halfspace_sss.neural.training.fit import CHECKPOINT, claim
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import check_folder, provenance, write_atomically
-
-if TYPE_CHECKING:
-    from full_geometry.integrators.walk_paths import FirstExits
 
 # ---- Where the learnt directional albedo is good enough for images ----------------------------
 # S sees the surface around both its points, alpha is a network of the exit alone, which misses what changes over a mean

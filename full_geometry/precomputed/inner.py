@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -25,10 +24,8 @@ from full_geometry.geometry.light_points import lattice, uniform_entries
 from full_geometry.geometry.points import cosine_above, floats, opaque, place, refract_in, surface_point
 from full_geometry.geometry.rounding import ray_from
 from full_geometry.geometry.sensors import independent
+from full_geometry.objects.objects import TranslucentObject
 from halfspace_sss.arrays import aligned
-
-if TYPE_CHECKING:
-    from full_geometry.objects.objects import TranslucentObject
 
 WIDTH = 0.9  # h in mean free paths
 MOST = 2**15  # nodes; h grows until there are no more

@@ -7,7 +7,7 @@ directions that light was gathered along where it is: by systematic sampling, as
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -15,10 +15,8 @@ import numpy as np
 
 from full_geometry.geometry.light_points import GOLDEN
 from full_geometry.geometry.points import EntrySample, SurfacePoint, of_rows
+from full_geometry.objects.objects import TranslucentObject
 from halfspace_sss.arrays import aligned
-
-if TYPE_CHECKING:
-    from full_geometry.objects.objects import TranslucentObject
 
 COUNT = 3 * 2**14  # pairs of all points,
 FEWEST = 6  # of a point,

@@ -21,12 +21,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from full_geometry.geometry.points import lane_numbers, opaque, sided
+from full_geometry.precomputed.inside_cells import CellIndex
 from full_geometry.precomputed.lit_points import bend, lit_points
 from full_geometry.walk.media import WalkMedia
 from full_geometry.walk.random_walk import (
@@ -43,9 +44,6 @@ from full_geometry.walk.random_walk import (
     start_walk,
 )
 from halfspace_sss.tracing.walk import generator, pass_seed
-
-if TYPE_CHECKING:
-    from full_geometry.precomputed.inside_cells import CellIndex
 
 FEW = 3  # dragon of marble: 2, 3 and 5 have 20, 13 and 7 times less variance x time, ever less of the noise of cells
 MOST_ADJOINT = 4.0

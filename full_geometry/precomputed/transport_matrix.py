@@ -39,9 +39,10 @@ mean light of a ring, and the share that it has of all, are averaged over the ne
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -59,16 +60,12 @@ from full_geometry.geometry.points import (
     opaque,
     wrapped,
 )
+from full_geometry.objects.objects import TranslucentObject
 from full_geometry.precomputed.entries import PLACES, StratifiedEntries
 from full_geometry.precomputed.point_pairs import EntryPairs, Rays, lit_pairs
 from halfspace_sss.arrays import aligned
 from halfspace_sss.interrupts import checkpoint
 from halfspace_sss.physics.fresnel import F_t
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from full_geometry.objects.objects import TranslucentObject
 
 PER_LENGTH = 2.0  # points over a transport mean free path
 FEWEST, MOST = 1024, 8192  # points

@@ -7,19 +7,17 @@ import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from full_geometry.geometry.sensors import camera_rays, seeded
+from full_geometry.integrators.walk_paths import FirstExits
 from full_geometry.scenes.reference_store import Reference, finite_pixels, load, save
-
-if TYPE_CHECKING:
-    from full_geometry.integrators.walk_paths import FirstExits
-    from full_geometry.settings import Settings
-    from full_geometry.walk.media import WalkMedia
+from full_geometry.settings import Settings
+from full_geometry.walk.media import WalkMedia
 
 TRIAL = 2**31  # number of a pass that is no part of the image
 PASSES = "passes of objects"
@@ -59,8 +57,6 @@ class CameraWalks:
 
     def hits(self, shape: mi.Shape) -> int:
         """About how many paths of one sample per pixel meet an object first."""
-
-        from full_geometry.integrators.walk_paths import FirstExits
 
         media = self.integrator.tracer(self.scene).visitor.media
         with dr.suspend_grad():

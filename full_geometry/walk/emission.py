@@ -13,17 +13,13 @@ that are drawn by emitters or by a proposal, must be that of this heuristic; so 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import drjit as dr
 import mitsuba as mi
 
+from full_geometry.geometry.instances import InstanceScene
 from full_geometry.geometry.rounding import blocked
-
-if TYPE_CHECKING:
-    from full_geometry.geometry.instances import InstanceScene
-    from full_geometry.geometry.shape import Geometry
-    from full_geometry.surface.wrapped import Wrapping
+from full_geometry.geometry.shape import Geometry
+from full_geometry.surface.wrapped import Wrapping
 
 MOST_SURVIVAL = 0.95  # of Russian roulette
 

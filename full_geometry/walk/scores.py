@@ -16,20 +16,26 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.geometry.points import SurfacePoint
+from full_geometry.surface.textured import TexturedMedium
 from full_geometry.surface.wrapped import surface_of
 from full_geometry.walk.media import Place, WalkMedia
-from full_geometry.walk.random_walk import ExitVisitor, StartVisitor, WalkExits, walk_from
-
-if TYPE_CHECKING:
-    from full_geometry.geometry.points import SurfacePoint
-    from full_geometry.surface.textured import TexturedMedium
-    from full_geometry.walk.random_walk import Crossing, Event, Visitor, Walk
+from full_geometry.walk.random_walk import (
+    Crossing,
+    Event,
+    ExitVisitor,
+    StartVisitor,
+    Visitor,
+    Walk,
+    WalkExits,
+    walk_from,
+)
 
 SLOTS = 4  # stays of a path in textured objects that are kept apart
 
