@@ -28,11 +28,6 @@ def device_of_walks() -> torch.device:
     return torch.device("cuda" if there else "cpu")
 
 
-def tensor(array: np.ndarray, device: torch.device) -> torch.Tensor:
-    """An array where networks are fitted; on the CPU without a copy."""
-    return torch.from_numpy(array).to(device)
-
-
 LEAST_SHARE = 1e-5  # of F_t P that comes back
 
 
@@ -319,7 +314,8 @@ class ObjectFit:
                 self.ends.add_proposals(y, V)
 
     def _tensor(self, array: np.ndarray) -> torch.Tensor:
-        return tensor(array, self.device)
+        """An array where networks are fitted; on the CPU without a copy."""
+        return torch.from_numpy(array).to(self.device)
 
     def _f(self, x: torch.Tensor, back: bool = False, of: torch.nn.ModuleDict | None = None) -> torch.Tensor:
         """f of the features x of pairs: S knows the directional albedos of both ends."""

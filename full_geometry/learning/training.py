@@ -139,7 +139,7 @@ class CameraExits:
         for j, (starts, ends) in enumerate(parts):
             n = dr.width(starts.p)
             m = round(proposed * n / self.walks)
-            at = starts.gather(_lanes(order.integers(0, n, m)))
+            at = starts.gather(aligned(mi.UInt32, order.integers(0, n, m)))
             walks.append(self.source.ended(starts, ends, (*seed, 5, j)))
             proposals.append(self.source.proposed(m, (*seed, 3, j), at))
         wanted = (self.walks, walks), (proposed, proposals)
@@ -158,7 +158,7 @@ class CameraExits:
         for part, a, b in zip(with_exits, ends, ends[1:]):
             own = chosen[(chosen >= a) & (chosen < b)] - a
             if len(own):
-                starts, ends = _points(part.gather(_lanes(own)))
+                starts, ends = _points(part.gather(aligned(mi.UInt32, own)))
                 parts.append((self.source.object.knowing(starts), ends))
         evaluate(parts)
         return parts
@@ -169,10 +169,6 @@ def _points(part: FirstExits) -> tuple[SurfacePoint, WalkExits]:
     starts = SurfacePoint(part.x_o, part.n_o, part.n_o_shading, part.w_o)
     ends = SurfacePoint(part.x_i, part.n_i, part.n_i_shading, part.w_i)
     return starts, WalkExits(ends, dr.select(part.order >= 1, part.throughput, 0), part.order, part.face)
-
-
-def _lanes(numbers: np.ndarray) -> mi.UInt32:
-    return aligned(mi.UInt32, numbers)
 
 
 VALIDATIONS = 4  # in a run

@@ -67,7 +67,7 @@ def draw(curves: PlottedCurves) -> Figure:
         above, below = grid[rows * block, column], grid[rows * (block + 1) - 1, column]
         _draw_radiance(above, curves, theta)
         above.set_ylim(*limits)
-        above.set_title(_title(theta, k), pad=3)
+        above.set_title(rf"({chr(97 + k)})  $\theta_i$ = {theta:g}°", pad=3)
         if column == 0:
             above.set_ylabel(r"$S$ [mm$^{-2}$ sr$^{-1}$]")
         if rows == 2:
@@ -84,10 +84,6 @@ def draw(curves: PlottedCurves) -> Figure:
 
 def _models(curves: PlottedCurves) -> list[str]:
     return [series for series in curves.series if series != TRACED]
-
-
-def _title(theta: float, k: int) -> str:
-    return rf"({chr(97 + k)})  $\theta_i$ = {theta:g}°"
 
 
 def _caption(curves: PlottedCurves) -> str:
