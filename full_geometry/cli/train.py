@@ -148,16 +148,5 @@ def errors_object(
 
 def object_table(rows: Sequence[ObjectError]) -> Table:
     headings = ("object", "channel", "model", "light", "error", "standard error", "mean / traced mean")
-    cells = [
-        (
-            r.object,
-            r.channel,
-            r.model,
-            r.light,
-            f"{100 * r.error:.3g}",
-            f"{100 * r.standard_error:.2g}",
-            f"{r.ratio:.3f}",
-        )
-        for r in rows
-    ]
+    cells = [(*r[:4], f"{100 * r.error:.3g}", f"{100 * r.standard_error:.2g}", f"{r.ratio:.3f}") for r in rows]
     return shared.table(headings, cells, title="errors, %", left=4)

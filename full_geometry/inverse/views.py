@@ -146,17 +146,8 @@ def _camera(name: str, camera: dict[str, Any], size: tuple[int, int], part: tupl
         raise ValueError(f"{name} must have {', '.join(CAMERA)}, got {', '.join(camera) or 'none'}")
     values = {key: numbers_of(f"{key} of {name}", value, CAMERA[key]) for key, value in camera.items()}
     left, top, right, bottom = map(int, part)
-    film = {
-        "type": "hdrfilm",
-        "height": size[0],
-        "width": size[1],
-        "pixel_format": "rgb",
-        "rfilter": {"type": "box"},
-        "crop_offset_x": left,
-        "crop_offset_y": top,
-        "crop_width": right - left,
-        "crop_height": bottom - top,
-    }
+    film = {"type": "hdrfilm", "height": size[0], "width": size[1], "pixel_format": "rgb", "rfilter": {"type": "box"}}
+    film |= {"crop_offset_x": left, "crop_offset_y": top, "crop_width": right - left, "crop_height": bottom - top}
     pose = mi.ScalarTransform4f().look_at(*(values[key] for key in ("origin", "target", "up")))
     if not np.isfinite(np.array(pose.matrix)).all():
         raise ValueError(f"up of {name} must not be along its view, got {camera['up']}")

@@ -193,14 +193,9 @@ def _sentence(name: str, model: str, enough: dict[str, Any], joined: bool) -> st
 
 def _record(learnt: LearntObject, model: str) -> dict[str, Any]:
     """What the header of the image tells of a training."""
-    return {
-        "object": learnt.object,
-        "model": model,
-        "weights": learnt.path.name if learnt.path else None,
-        "steps": learnt.steps,
-        "seconds": learnt.seconds,
-        "errors": [row._asdict() for row in learnt.errors],
-    }
+    about = {"object": learnt.object, "model": model, "weights": learnt.path.name if learnt.path else None}
+    errors = [row._asdict() for row in learnt.errors]
+    return about | {"steps": learnt.steps, "seconds": learnt.seconds, "errors": errors}
 
 
 def _forget(parts: dict[str, Path]) -> None:
@@ -281,10 +276,5 @@ def _spread(variance: np.ndarray, tiles: np.ndarray) -> float:
 
 
 def _told(image: Reference) -> dict[str, float | int | None]:
-    error = image.relative_error
-    return {
-        "spp": image.spp,
-        "passes": image.passes,
-        "seconds": image.seconds,
-        "relative_error": error if np.isfinite(error) else None,
-    }
+    error = image.relative_error if np.isfinite(image.relative_error) else None
+    return {"spp": image.spp, "passes": image.passes, "seconds": image.seconds, "relative_error": error}

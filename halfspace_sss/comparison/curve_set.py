@@ -221,14 +221,8 @@ class CurveSet:
         """Everything that defines the result, ready for JSON."""
         medium = {name: getattr(self.medium, name) for name in ("sigma_s", "sigma_a", "g", "eta", "sigma_t", "albedo")}
         names = ("title", "theta_i_deg", "theta_o_deg", "delta_phi_deg", "line_deg", "half_width", "orders", "series")
-        return {
-            "medium": medium,
-            **{name: getattr(self, name) for name in names},
-            "r_edges_mm": self.r_edges.tolist(),
-            "n_paths": self.n_paths,
-            "seed": self.seed,
-            "backend": self.backend,
-        }
+        about = {"medium": medium, **{name: getattr(self, name) for name in names}, "r_edges_mm": self.r_edges.tolist()}
+        return about | {"n_paths": self.n_paths, "seed": self.seed, "backend": self.backend}
 
     def save(self, folder: str | Path, name: str = "curves") -> list[Path]:
         """Write NAME.csv (every series), NAME_errors.csv, NAME.json (provenance) and the figure as NAME.pdf and .png.
