@@ -26,11 +26,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from full_geometry.scenes.scene_files import PATH_TRACED
-from full_geometry.settings import GATHERED_LIGHTS
+from full_geometry.settings import GATHERED_LIGHTS, PATH_TRACED
 from full_geometry.trade.assessing import assess
 from full_geometry.trade.results import UNNAMED, Assessment, ObjectTrade, TechniqueTrade
-from full_geometry.trade.techniques import CORRECTED, LAMBERT, WALKED, Job, Technique
+from full_geometry.trade.techniques import WALKED, Job, Technique
 from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.comparison.curve_set import TRACED
 from halfspace_sss.comparison.model_errors import TracedMaps, model_error, references
@@ -162,15 +161,10 @@ def advise(assessment: Assessment, job: Job) -> Advice:
 
 
 def _best(advice: ObjectAdvice, kind: str) -> Option:
-    """The fastest of an object by an integrator; what does not spread is the same in sampled and gathered light."""
-
-    def served(technique: Technique) -> bool:
-        if technique.walks or kind.startswith(PATH_TRACED):
-            return technique.name == kind
-        light = kind.removeprefix(INTEGRATOR).removeprefix(", ") or "sampled"
-        return technique.light == light or (technique.model == LAMBERT and light != CORRECTED)
-
-    options = [o for o in advice.options if o.way and served(Technique.of(o.way))]
+    """The fastest of an object by an integrator."""
+    light = kind.removeprefix(INTEGRATOR).removeprefix(", ") or "sampled"
+    walks = kind.startswith(PATH_TRACED)
+    options = [o for o in advice.options if o.way and (o.way == kind if walks else Technique.of(o.way).serves(light))]
     return min(options, key=lambda o: o.seconds, default=Option("", math.inf, 0, math.nan, ""))
 
 

@@ -91,8 +91,8 @@ def ways_of(named: Sequence[str], light: str) -> list[str]:
     """Names of the techniques that are measured: of the candidates, or of models that are named."""
     lights = _lights(light)
     if AUTO in named:
-        of_models = {each for each in map(Technique.of, CANDIDATES) if each.light in lights or each.model == LAMBERT}
-        return [name for name in CANDIDATES if Technique.of(name).walks or Technique.of(name) in of_models]
+        known = {name: Technique.of(name) for name in CANDIDATES}
+        return [name for name, way in known.items() if way.walks or way.light in lights or way.model == LAMBERT]
     ways = [WALKS, PRECOMPUTED_WALKS, *(_way(name, light) for name in named for light in lights)]
     return list(dict.fromkeys(way.name for way in ways))
 
@@ -143,9 +143,8 @@ class Pick(NamedTuple):
 
 def picked(assessed: ObjectTrade, tolerance: float, light: str = "sampled", model: str = AUTO) -> Pick:
     """The model for an object among those of one kind of light, or what can be said of the one that is named."""
-    rows = {_model(row.way, light): row for row in assessed.ways if not row.refusal and _model(row.way, light)}
-    if model != AUTO:
-        rows = {name: row for name, row in rows.items() if name == model}
+    known = {Technique.of(row.way): row for row in assessed.ways if not row.refusal}
+    rows = {way.model: row for way, row in known.items() if way.serves(light) and model in (AUTO, way.model)}
     if not assessed.ways or assessed.is_dark:
         name = model if model != AUTO else DEFAULT if DEFAULT in rows or not rows else min(rows)
         why = f"object {assessed.object!r}: {name}, as the camera sees nothing to compare"
@@ -163,13 +162,6 @@ def picked(assessed: ObjectTrade, tolerance: float, light: str = "sampled", mode
     if walks < seconds[name]:
         why += "; translucent_walk would be better" + (" and faster" if keeps else ", which has no bias")
     return Pick(name, seconds[name], f"object {assessed.object!r}: {row.way}, {why}", keeps)
-
-
-def _model(way: str, light: str) -> str:
-    """The model of a technique in one kind of light; "" of others."""
-    technique = Technique.of(way)
-    same = technique == _way(technique.model, light) and not (technique.model == LAMBERT and light == CORRECTED)
-    return technique.model if same and not technique.walks else ""
 
 
 # --------------------------------------------------------------------------------------------------

@@ -62,6 +62,10 @@ class Technique:
         """Whether light is gathered before the first sample."""
         return self.light in GATHERED_LIGHTS
 
+    def serves(self, light: str) -> bool:
+        """Whether it is a model in such light; a diffuse surface, which gathers nothing, is the same in gathered."""
+        return not self.walks and (self.light == light or (self.model == LAMBERT and light != CORRECTED))
+
     @property
     def halves(self) -> tuple[Technique, ...]:
         """The techniques that it is measured by: itself, or two independent parts of gathered or precomputed light.
