@@ -19,15 +19,6 @@ from full_geometry.transport.patches import Patches
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.neural.training.fit import Descent, cosine, gone_on_with, torch_threads, warm_up, write_checkpoint
 
-# ---- Where networks are fitted: beside the walks that are their data -------------------------------
-
-
-def device_of_walks() -> torch.device:
-    """The GPU if Mitsuba's variant runs there and torch can, else the CPU."""
-    there = (mi.variant() or "").startswith("cuda") and torch.cuda.is_available()
-    return torch.device("cuda" if there else "cpu")
-
-
 LEAST_SHARE = 1e-5  # of F_t P that comes back
 
 
@@ -228,7 +219,7 @@ STANDARD = Recipe()
 
 
 class ObjectFit:
-    """The state of a fit, which follows from recipe, seed, number of steps, data and device, see `device_of_walks`.
+    """The state of a fit, which follows from recipe, seed, number of steps, data and device.
     `n_in`: features of a pair. `patches`: of the surface, for whose weights a network is fitted beside; None for a
     shape without faces."""
 
@@ -242,7 +233,9 @@ class ObjectFit:
         }
         if patches is not None:
             parts["patches"] = PatchLogits(self.n_side, patches.areas, PATCH_HIDDEN, seed)
-        self.device = device_of_walks()
+        # beside the walks that are the data: the GPU if Mitsuba's variant runs there and torch can, else the CPU
+        there = (mi.variant() or "").startswith("cuda") and torch.cuda.is_available()
+        self.device = torch.device("cuda" if there else "cpu")
         self.ends = Ends(channels, self.n_side, self.device)
         self.modules = torch.nn.ModuleDict(parts).to(self.device)
         self.descent = Descent(self.modules, parts=list(self.modules.values()), average=AVERAGE, fused=True)

@@ -121,8 +121,10 @@ def render(
     parts, base = files(path), path if isinstance(resume, bool) else Path(resume)
     if resume is False:
         _forget(parts)
-    elif base != path:
-        _fetch(files(base), parts)
+    elif base != path:  # goes on with the parts of a finished image, which stay as they are
+        for name, there in files(base).items():
+            if name != TRAINING and there.exists() and not parts[name].exists():
+                save(parts[name], load(there))
     names = untrained(scene) if train_seconds > 0 else {}
     how = {"sensor": sensor, "seed": seed, "progress": listeners.rendered, "denoise": denoise, **limits}
     if not names and not parts["walks.exr"].exists():
@@ -206,13 +208,6 @@ def _forget(parts: dict[str, Path]) -> None:
         else:
             for one in (path, path.with_suffix(".json")):
                 one.unlink(missing_ok=True)
-
-
-def _fetch(there: dict[str, Path], here: dict[str, Path]) -> None:
-    """Go on with the parts of a finished image, which stay as they are."""
-    for name in ("walks.exr", "model.exr"):
-        if there[name].exists() and not here[name].exists():
-            save(here[name], load(there[name]))
 
 
 # --------------------------------------------------------------------------------------------------

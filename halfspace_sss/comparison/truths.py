@@ -6,7 +6,7 @@ import csv
 import math
 import re
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -293,27 +293,18 @@ def validate(
     if not truths:
         raise ValueError("rows must leave at least one row that the tracer covers, got none")
     started, comparisons = time.perf_counter(), {}
-    groups = _groups(truths)
-    for done, group in enumerate(groups, 1):
-        for comparison in _compare(group, _group_seed(seed, group[0]), 10.0 if quick else 1.0):
+    groups: dict[tuple, list[Truth]] = {}  # that one run answers each
+    for truth in truths:
+        groups.setdefault((truth.medium, truth.mu_i, truth.alone), []).append(truth)
+    for done, group in enumerate(groups.values(), 1):
+        # a seed of its own, the same whichever other rows are traced
+        own = int(np.random.SeedSequence([seed, int(group[0].id[1:])]).generate_state(1)[0])
+        for comparison in _compare(group, own, 10.0 if quick else 1.0):
             comparisons[comparison.truth.id] = comparison
         if progress:
             progress(done, len(groups))
     ordered = [comparisons[t.id] for t in truths]
     return Validation(ordered, not_covered, seed, quick, time.perf_counter() - started)
-
-
-def _groups(truths: Iterable[Truth]) -> list[list[Truth]]:
-    """Rows that one run answers: the same medium and incidence, order 2 and light in time apart."""
-    groups: dict[tuple, list[Truth]] = {}
-    for truth in truths:
-        groups.setdefault((truth.medium, truth.mu_i, truth.alone), []).append(truth)
-    return list(groups.values())
-
-
-def _group_seed(seed: int, first: Truth) -> int:
-    """A seed of its own for each group, the same whichever other rows are traced."""
-    return int(np.random.SeedSequence([seed, int(first.id[1:])]).generate_state(1)[0])
 
 
 def _compare(group: Sequence[Truth], seed: int, loosen: float) -> list[Comparison]:
