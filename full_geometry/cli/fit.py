@@ -163,19 +163,17 @@ def scene_with_medium(scene: Path, name: str | None, found: MaterialFit, painted
     if is_gltf(scene):
         return None
     root = ElementTree.parse(scene).getroot()
-    shapes = [shape for shape in root.iter("shape") if name is None or shape.get("id") == name]
-    own = {id(bsdf): shape for shape in shapes for bsdf in shape.iter("bsdf") if bsdf.get("type") == "translucent"}
-    surfaces = [bsdf for shape in shapes for bsdf in shape.iter("bsdf") if bsdf.get("type") == "translucent"]
-    ids = {ref.get("id"): shape for shape in shapes for ref in shape.iter("ref")}
-    surfaces += [b for b in root.findall("bsdf") if b.get("type") == "translucent" and b.get("id") in ids]
+    shared, surfaces = {bsdf.get("id"): bsdf for bsdf in root.findall("bsdf")}, {}
+    for shape in (shape for shape in root.iter("shape") if name is None or shape.get("id") == name):
+        below = [*shape.iter("bsdf"), *(shared.get(ref.get("id")) for ref in shape.iter("ref"))]
+        surfaces |= {bsdf: shape for bsdf in below if bsdf is not None and bsdf.get("type") == "translucent"}
     if len(surfaces) != 1:
         return None
-    surface, medium = surfaces[0], found.medium
+    ((surface, shape),), medium = surfaces.items(), found.medium
     for node in root.iter("string"):
         if node.get("name") == "filename" and "$" not in node.get("value", "$"):
             node.set("value", str((scene.parent / node.get("value")).resolve()))
     if found.textures:
-        shape = own.get(id(surface), ids.get(surface.get("id")))
         _paint(root, surface, shape, found, painted)
     else:
         _remove(surface, *COEFFICIENTS)

@@ -8,7 +8,7 @@ import math
 import time
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -247,7 +247,7 @@ class _ShapeTraining:
         record = {**drawn.record(), "kept": data is not None, "cpu_seconds": time.process_time() - started}
         if place:
             stream = io.BytesIO()
-            np.savez(stream, record=np.array(json.dumps(record)), **(data.arrays() if data else {}))
+            np.savez(stream, record=np.array(json.dumps(record)), **(vars(data) if data else {}))
             write_atomically(place, stream.getvalue())
         return data, record
 
@@ -401,7 +401,6 @@ EVENTS = 1e6  # of the walks of one object
 FEWEST_WALKS, WALKS = 2**13, 2**15
 KEPT = 2**13  # walks that left, and proposals, of one object
 FEWEST_EXITS = 128
-NAMES = ("walks", "T", "proposals", "W", "medium", "share")
 
 
 @dataclass(frozen=True, eq=False)
@@ -422,13 +421,10 @@ class PairData:
     medium: np.ndarray
     share: float
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        return {name: np.asarray(getattr(self, name)) for name in NAMES}
-
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> PairData:
         """Read pairs from the arrays of a file; KeyError if it is another one."""
-        stored = {name: arrays[name] for name in NAMES}
+        stored = {each.name: arrays[each.name] for each in fields(cls)}
         return cls(**{**stored, "share": float(stored["share"])})
 
 
