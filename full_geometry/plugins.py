@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import importlib
 import threading
-from typing import TYPE_CHECKING
 
+import mitsuba as mi
+
+from full_geometry.integrators.bssrdf import integrator_class
+from full_geometry.integrators.translucent_walk import walk_integrator_class
 from full_geometry.scenes.scene_files import apart, plainly
-from full_geometry.settings import VARIANTS, variant_channels
-from halfspace_sss.backend import BackendError, prepare_llvm, two_threads
-
-if TYPE_CHECKING:
-    import mitsuba as mi
-
-    from full_geometry.settings import Choices, Settings
+from full_geometry.settings import VARIANTS, Choices, Settings, variant_channels
+from full_geometry.surface.sheets import sheet_class
+from full_geometry.surface.translucent import translucent_class
+from full_geometry.transport.models import check_model, model_names
+from halfspace_sss.backend import prepare_llvm, two_threads
 
 TRADE = "full_geometry.trade.automatic"
 _active = False
@@ -29,13 +30,9 @@ def register() -> None:
 
     Raises:
         ValueError: no variant is set, or the plugins do not run under it (scalar or polarised ones).
-        BackendError: Mitsuba is not installed, or the LLVM that Dr.Jit found would abort the process.
+        BackendError: the LLVM that Dr.Jit found would abort the process.
     """
     global _active
-    try:
-        import mitsuba as mi
-    except ImportError as error:
-        raise BackendError('rendering needs Mitsuba 3: pip install "halfspace-sss[render]"') from error
     variant_channels()
     with _lock:
         _register_all()
@@ -59,17 +56,9 @@ def _choose(scene: mi.Scene, settings: Settings) -> Choices:
 
 
 def _register_all() -> None:
-    import mitsuba as mi
-
     if mi.variant().startswith("llvm"):
         prepare_llvm()
     two_threads()
-
-    from full_geometry.integrators.bssrdf import integrator_class
-    from full_geometry.integrators.translucent_walk import walk_integrator_class
-    from full_geometry.surface.sheets import sheet_class
-    from full_geometry.surface.translucent import translucent_class
-    from full_geometry.transport.models import check_model, model_names
 
     def check(model: str) -> None:
         check_model(model, model_names())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import importlib
 import os
 import sys
 import time
@@ -23,6 +24,14 @@ OLDEST_LLVM = 17  # 14 and 15 abort the process ("Cannot select: fminimum")
 
 class BackendError(RuntimeError):
     """No usable Dr.Jit backend on this machine."""
+
+
+def needed(module: str, what: str, extra: str) -> ModuleType:
+    """A module that comes with an extra of this package; BackendError says what needs it, and how it is installed."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise BackendError(f'{what}: pip install "halfspace-sss[{extra}]"') from error
 
 
 def _llvm_version(path: str) -> int | None:

@@ -26,7 +26,7 @@ import numpy as np
 
 import figures
 from figures.parts.part import QUALITIES, Params, Part, Result, Task, canonical, check_quality, keys_of
-from halfspace_sss.backend import BackendError, two_threads
+from halfspace_sss.backend import needed, two_threads
 from halfspace_sss.checks import check_choice
 from halfspace_sss.executors import completed
 from halfspace_sss.progress import Progress, ProgressText
@@ -35,12 +35,9 @@ from halfspace_sss.provenance import JsonDict, check_folder, provenance, write_t
 
 def _mitsuba() -> tuple[type, type]:
     """Bitmap and MemoryStream, which need no variant."""
-    try:
-        from mitsuba import Bitmap, MemoryStream
-    except ModuleNotFoundError as error:
-        raise BackendError('images need Mitsuba 3: pip install "halfspace-sss[render]"') from error
+    mi = needed("mitsuba", "images need Mitsuba 3", "render")
     two_threads()
-    return Bitmap, MemoryStream
+    return mi.Bitmap, mi.MemoryStream
 
 
 def exr_bytes(image: np.ndarray, name: str, about: str) -> bytes:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from halfspace_sss.backend import BackendError, prepare_llvm
+from halfspace_sss.backend import BackendError, needed, prepare_llvm
 from halfspace_sss.cli import shared
 from halfspace_sss.interrupts import interrupts
 
@@ -48,10 +48,7 @@ def use_mitsuba(variant: str) -> None:
     """Mitsuba with our plugins, under a variant."""
     if variant.startswith("llvm"):
         prepare_llvm()
-    try:
-        import mitsuba as mi
-    except ImportError as error:
-        raise BackendError('rendering needs Mitsuba 3: pip install "halfspace-sss[render]"') from error
+    mi = needed("mitsuba", "rendering needs Mitsuba 3", "render")
     import full_geometry
 
     try:

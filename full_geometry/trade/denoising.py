@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from full_geometry.trade.image_differences import check_image
-from halfspace_sss.backend import BackendError, clock
+from halfspace_sss.backend import clock, needed
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -19,11 +19,7 @@ GUIDES = "albedo:albedo,n:sh_normal"  # of the integrator `aov`
 
 def check_denoiser() -> ModuleType:
     """The package `mitsuba_oidn`; BackendError with what to install where there is none."""
-    try:
-        import mitsuba_oidn
-    except ImportError as error:
-        raise BackendError('denoising needs mitsuba-oidn: pip install "halfspace-sss[figures]"') from error
-    return mitsuba_oidn
+    return needed("mitsuba_oidn", "denoising needs mitsuba-oidn", "figures")
 
 
 def cover(scene: mi.Scene, spp: int = GUIDE_SPP) -> np.ndarray:

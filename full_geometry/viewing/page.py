@@ -25,7 +25,7 @@ from full_geometry.viewing.edits import Camera, Edits, Way
 from full_geometry.viewing.live import LiveScene
 from full_geometry.viewing.screen import Screen, Wish
 from halfspace_sss import materials
-from halfspace_sss.backend import BackendError
+from halfspace_sss.backend import BackendError, needed
 from halfspace_sss.checks import check_count
 from halfspace_sss.physics.medium import Medium
 
@@ -61,10 +61,7 @@ class Page:
         self, scene: dict[str, Any] | str | Path, host: str = "127.0.0.1", port: int = 0, pixels: int = PIXELS,
         parameters: dict[str, str] | None = None,
     ) -> None:  # fmt: skip
-        try:
-            import viser
-        except ImportError as error:
-            raise BackendError('a page needs viser: pip install "halfspace-sss[view]"') from error
+        viser = needed("viser", "a page needs viser", "view")
         check_count("pixels", pixels, SIDE**2)
         self.live, self._pixels, self._source = LiveScene(scene, parameters), pixels, (scene, parameters)
         self.token = "" if host in LOOPBACK else secrets.token_urlsafe(16)

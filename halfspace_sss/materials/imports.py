@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from halfspace_sss.backend import BackendError
+from halfspace_sss.backend import needed
 from halfspace_sss.checks import check_choice
 from halfspace_sss.materials.material import Material
 from halfspace_sss.physics.medium import Medium
@@ -72,10 +72,7 @@ def import_materials(path: str | os.PathLike, mm_per_unit: float | None = None) 
 
 
 def _of_materialx(path: Path, unit: float) -> Iterator[Material]:
-    try:
-        import MaterialX as mx  # noqa: N813
-    except ImportError as error:
-        raise BackendError('.mtlx needs MaterialX: pip install "halfspace-sss[import]"') from error
+    mx = needed("MaterialX", ".mtlx needs MaterialX", "import")
     document = mx.createDocument()
     try:
         mx.readFromXmlFile(document, str(path))
@@ -150,10 +147,7 @@ def modulated(ior: float, weight: float) -> float:
 
 def read_gltf(path: Path) -> pygltflib.GLTF2:
     """A glTF file as pygltflib reads it; ValueError if it cannot, BackendError without that package."""
-    try:
-        import pygltflib
-    except ImportError as error:
-        raise BackendError(f'{path.suffix} needs pygltflib: pip install "halfspace-sss[import]"') from error
+    pygltflib = needed("pygltflib", f"{path.suffix} needs pygltflib", "import")
     try:
         return pygltflib.GLTF2().load(str(path))
     except Exception as error:  # pygltflib raises what json, struct and dataclasses_json raise
