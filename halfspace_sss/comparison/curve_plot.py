@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,46 +11,19 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter
 
 from halfspace_sss.comparison.style import TEXT, TRACED, look, paper, saved
-from halfspace_sss.physics.medium import Medium
 
 RATIO_SPAN = 12.0  # the ratio panels show 1/12 to 12 at most; what is beyond lies at the edge of the panel
 MOST_COLUMNS = 4
+CurveSet = Curve = Any  # those of `curve_set`, which imports this module to draw itself
 
 
-class PlottedCurve(Protocol):
-    """What is drawn of a `curve_set.Curve`."""
-
-    series: str
-    orders: str
-    S: np.ndarray
-    standard_error: np.ndarray
-
-
-class PlottedCurves(Protocol):
-    """What is drawn of a `curve_set.CurveSet`, which draws itself by this module."""
-
-    title: str
-    medium: Medium
-    theta_o_deg: float
-    delta_phi_deg: float
-    line_deg: float
-    r: np.ndarray
-    r_edges: np.ndarray
-    theta_i_deg: tuple[float, ...]
-    series: tuple[str, ...]
-    curves: Sequence[PlottedCurve]
-
-    def curve(self, series: str, theta_i_deg: float) -> PlottedCurve:
-        """The curve of one series and direction."""
-
-
-def render(curves: PlottedCurves) -> dict[str, bytes]:
+def render(curves: CurveSet) -> dict[str, bytes]:
     """The figure as {"pdf": bytes, "png": bytes}."""
     with paper():
         return saved(draw(curves))
 
 
-def draw(curves: PlottedCurves) -> Figure:
+def draw(curves: CurveSet) -> Figure:
     """One column for each direction of incidence: above S(r) with 2 standard errors, below S over path-traced S.
     Without a path-traced curve there is nothing below."""
     angles, rows = curves.theta_i_deg, 2 if TRACED in curves.series else 1
@@ -82,11 +55,11 @@ def draw(curves: PlottedCurves) -> Figure:
     return figure
 
 
-def _models(curves: PlottedCurves) -> list[str]:
+def _models(curves: CurveSet) -> list[str]:
     return [series for series in curves.series if series != TRACED]
 
 
-def _caption(curves: PlottedCurves) -> str:
+def _caption(curves: CurveSet) -> str:
     m = curves.medium
     name = f"{curves.title}: " if curves.title else ""
     line = {90.0: "perpendicular to the plane of incidence", 0.0: "in the forward direction"}
@@ -102,7 +75,7 @@ def _positive(values: np.ndarray) -> np.ndarray:
     return np.where(values > 0, values, np.nan)
 
 
-def _limits(curves: PlottedCurves) -> tuple[float, float]:
+def _limits(curves: CurveSet) -> tuple[float, float]:
     """About the path-traced curves and, up to a factor of 30 above and 10 below, the models."""
     known = [c for c in curves.curves if c.series == TRACED] or curves.curves
     traced = np.concatenate([c.S[c.S > 3 * c.standard_error] for c in known])
@@ -114,7 +87,7 @@ def _limits(curves: PlottedCurves) -> tuple[float, float]:
     return 0.6 * bottom, 1.7 * top
 
 
-def _draw_radiance(ax: Axes, curves: PlottedCurves, theta: float) -> None:
+def _draw_radiance(ax: Axes, curves: CurveSet, theta: float) -> None:
     ax.set(xscale="log", yscale="log", xlim=(curves.r_edges[0], curves.r_edges[-1]))
     for series in _models(curves):
         style = look(series)
@@ -127,7 +100,7 @@ def _draw_radiance(ax: Axes, curves: PlottedCurves, theta: float) -> None:
     _ticks(ax)
 
 
-def _draw_ratio(ax: Axes, curves: PlottedCurves, theta: float) -> None:
+def _draw_ratio(ax: Axes, curves: CurveSet, theta: float) -> None:
     traced = curves.curve(TRACED, theta)
     S = _positive(np.where(traced.S > 3 * traced.standard_error, traced.S, np.nan))
     noise = 2 * traced.standard_error / S
@@ -152,13 +125,13 @@ def _ticks(ax: Axes) -> None:
     ax.tick_params(which="both", top=True, right=True)
 
 
-def _legend(figure: Figure, curves: PlottedCurves, columns: int) -> None:
+def _legend(figure: Figure, curves: CurveSet, columns: int) -> None:
     from matplotlib.lines import Line2D
 
     first = curves.curves[0]
     dots = {"color": "k", "lw": 0.7, "marker": "o", "ms": 2.2, "mew": 0}
     handles = [Line2D([], [], label=_label(first), **dots)] if first.series == TRACED else []
-    firsts: Sequence[PlottedCurve] = [curves.curve(s, curves.theta_i_deg[0]) for s in _models(curves)]
+    firsts: Sequence[Curve] = [curves.curve(s, curves.theta_i_deg[0]) for s in _models(curves)]
     for c in firsts:
         style = look(c.series)
         handles.append(Line2D([], [], color=style.color, ls=style.dash, label=_label(c)))
@@ -171,7 +144,7 @@ def _legend(figure: Figure, curves: PlottedCurves, columns: int) -> None:
     )  # fmt: skip
 
 
-def _label(c: PlottedCurve) -> str:
+def _label(c: Curve) -> str:
     """A star marks models that contain single scattering."""
     if c.series == TRACED:
         return r"Path traced ($\pm 2\,\sigma$)"
