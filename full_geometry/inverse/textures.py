@@ -31,6 +31,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.ndimage import uniform_filter
 from scipy.sparse import block_diag, csr_array, diags_array, hstack, kron, vstack
 from scipy.sparse.linalg import LinearOperator, cg
 
@@ -49,7 +50,6 @@ from full_geometry.inverse.comparing import (
     arrays_of_means,
     kept_at,
     means_of_arrays,
-    neighbour_sums,
 )
 from full_geometry.inverse.parameters import (
     ALBEDO,
@@ -68,7 +68,7 @@ from full_geometry.surface.wrapped import surface_of
 
 STEPS = 60
 STEP = 0.15  # of a parameter, for differences
-NEAR_PIXELS = 1  # over which differences are averaged
+AVERAGED = (3, 3, 1)  # pixels over which differences are averaged
 RAYS = 16  # of a pixel, for D
 LAST = {"albedo": 9.0, "reflectance": 9.0, "g": 2.9}  # size of variables beyond which they are at a bound
 EXPOSURE_MEMORY = 0.2  # of the step to the best exposure, what is taken
@@ -459,7 +459,7 @@ class TextureDescent:
         x, steps = self._followed(), {v.name: v.step(x) for v, x in zip(self.variables, self._parts())}
         image, found = self.comparison.sloped(which, k, purpose, x, self._put, sloped, steps)
         if sloped and self.comparison.by_differences:  # their noise would make steps short
-            found = [neighbour_sums(each, NEAR_PIXELS) / (2 * NEAR_PIXELS + 1) ** 2 for each in found]
+            found = [uniform_filter(each, AVERAGED, mode="constant") for each in found]
         return image, np.stack([each.ravel() for each in found]) if sloped else None
 
     def _put(self, followed: Variables) -> None:

@@ -274,12 +274,9 @@ def surface(distance: Distance, box: Box, resolution: int) -> Mesh:
 
 def _without_crumbs(vertices: np.ndarray, faces: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
     """The mesh without its pieces, or bubbles inside, whose volume is below `least`, mm³."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
+    import igl
 
-    ends, n = np.concatenate([faces[:, :2], faces[:, 1:]]), len(vertices)
-    graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(n, n))
-    pieces, label = connected_components(graph, directed=False)
+    pieces, label, _ = igl.connected_components(igl.adjacency_matrix(faces))
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     volume = np.bincount(label[faces[:, 0]], np.einsum("ij,ij->i", a, np.cross(b, c)) / 6, minlength=pieces)
     faces = faces[np.abs(volume)[label[faces[:, 0]]] >= least]
