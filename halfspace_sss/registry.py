@@ -6,7 +6,7 @@ the group `halfspace_sss.models`, each a list of classes: it is taken as a whole
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
 from analytic_models import MODELS as ANALYTIC
 from halfspace_sss.checks import did_you_mean
@@ -60,6 +60,16 @@ def bssrdf(name: str, medium: Medium) -> BSSRDF:
     if isinstance(medium, Layers):
         raise ValueError(f"medium must be one Medium for {name}, got Layers of {len(medium)}; `trace` takes those")
     return model_class(name)(medium_of(medium))
+
+
+def models_of(medium: Medium, names: Iterable[str] | None = None) -> Iterator[BSSRDF]:
+    """The models for a medium, of all or of some names; those that refuse it are left out."""
+    for name in models() if names is None else names:
+        try:
+            model = bssrdf(name, medium)
+        except ValueError:
+            continue
+        yield model
 
 
 def model_class(name: str) -> type[BSSRDF]:

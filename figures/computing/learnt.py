@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING
 from figures.computing.scans import BUNNY, MM_PER_UNIT, SCANS, prepare, scan_scene
 from figures.modelling.objects import candle_parts, learnable_parts, make_candle, make_varying, tissue
 from figures.parts.part import Part, Result, SceneDict, Task
-from halfspace_sss import bssrdf, materials, models
+from halfspace_sss import materials
 from halfspace_sss.neural.network import channels
 from halfspace_sss.neural.store import weights_in
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder
+from halfspace_sss.registry import models_of
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -121,14 +122,7 @@ def trained(task: Task, scene: SceneDict, name: str) -> dict[str, object]:
 
 def accepting(medium: Medium) -> list[str]:
     """Names of the models that can be made for the medium: a learnt one without weights for it is not among them."""
-    results = []
-    for name in models():
-        try:
-            bssrdf(name, medium)
-        except ValueError:
-            continue
-        results.append(name)
-    return results
+    return [model.name for model in models_of(medium)]
 
 
 def weight_files(model: str, medium: Medium) -> tuple[Path, ...]:

@@ -26,7 +26,7 @@ from halfspace_sss.physics.backbone import unwarp
 from halfspace_sss.physics.fresnel import F_t, mu_internal
 from halfspace_sss.physics.medium import Medium, eval_hg
 from halfspace_sss.progress import NamedProgress
-from halfspace_sss.registry import bssrdf, models
+from halfspace_sss.registry import models, models_of
 
 if TYPE_CHECKING:
     import pandas
@@ -377,13 +377,9 @@ def error_table(
 def _rows(label: str, reference: TracedMaps, names: list[str]) -> list[dict[str, float | str]]:
     """Of one medium, a row for each model that accepts it."""
     rows, m = [], reference.medium
-    for name in names:
-        try:
-            model = bssrdf(name, m)
-        except ValueError:
-            continue  # the model refuses this medium
+    for model in models_of(m, names):
         e = model_error(model, reference)
-        row = {"medium": label, "albedo": float(m.albedo), "g": float(m.g), "eta": m.eta, "model": name}
+        row = {"medium": label, "albedo": float(m.albedo), "g": float(m.g), "eta": m.eta, "model": model.name}
         row |= {"orders": model.orders, "error": e.error, "error_square": e.square}
         row |= {"error_square_standard_error": e.square_error, "raw": e.raw, "noise": e.noise, "bias": e.bias}
         rows.append(row | {"bias_noise": e.bias_noise} | {f"r {d}": v for d, v in e.by_decade.items()})

@@ -22,7 +22,7 @@ from halfspace_sss.measure.reflected_flux import reflectance_estimate
 from halfspace_sss.physics.fresnel import F_r
 from halfspace_sss.physics.medium import eval_hg, sample_hg
 from halfspace_sss.progress import NamedProgress
-from halfspace_sss.registry import bssrdf, models
+from halfspace_sss.registry import models_of
 
 if TYPE_CHECKING:
     import pandas
@@ -125,24 +125,20 @@ def reflectance_truths(
     new ones are added. Media without scattering are left out; R_total includes the surface reflection."""
     import pandas
 
-    names, result = list(models() if names is None else names), {} if kept is None else kept
+    names, result = None if names is None else list(names), {} if kept is None else kept
     truths, rows = [t for t in read_truths()[0] if t.measure in MEASURES and float(t.medium.albedo) > 0], []
     for k, t in enumerate(truths):
-        for name in names:
-            try:
-                model, m = bssrdf(name, t.medium), t.medium
-            except ValueError:
-                continue  # the model refuses this medium
-            key = f"{name} {' '.join(model.checksums)} {float(m.albedo)!r} {float(m.g)!r} {m.eta!r} {t.mu_i}"
+        m = t.medium
+        for model in models_of(m, names):
+            key = f"{model.name} {' '.join(model.checksums)} {float(m.albedo)!r} {float(m.g)!r} {m.eta!r} {t.mu_i}"
             if key not in result:
                 result[key] = _reflectance(model, t.mu_i)
             R, error = (t.factor * v for v in result[key])
             if t.measure == "R_total":
                 R += float(F_r(t.mu_i, m.eta))
-            row = {"id": t.id, "kind": t.kind, "model": name, "albedo": float(m.albedo), "g": float(m.g), "eta": m.eta}
-            rows.append(
-                row | {"mu_i": t.mu_i, "truth": t.value, "value": R, "error": error, "relative_error": R / t.value - 1}
-            )
+            row = {"id": t.id, "kind": t.kind, "model": model.name, "albedo": float(m.albedo), "g": float(m.g)}
+            row |= {"eta": m.eta, "mu_i": t.mu_i, "truth": t.value, "value": R, "error": error}
+            rows.append(row | {"relative_error": R / t.value - 1})
         if progress:
             progress("truths", k + 1, len(truths))
     return pandas.DataFrame(rows)

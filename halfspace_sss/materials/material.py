@@ -13,7 +13,7 @@ import numpy as np
 
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.registry import bssrdf, models
+from halfspace_sss.registry import bssrdf, models_of
 
 LONGEST_NAME = 80  # bytes in UTF-8; file systems end at 255
 
@@ -134,7 +134,7 @@ class Material:
 
     def models(self) -> tuple[str, ...]:
         """Names of the models that `bssrdf` can make for this material; a model that refuses its medium is left out."""
-        return tuple(name for name in models() if self._accepted_by(name))
+        return tuple(model.name for model in models_of(self.medium))
 
     def bssrdf(self, model: str) -> BSSRDF:
         """The BSSRDF of this material by the model of that name.
@@ -143,13 +143,6 @@ class Material:
             ValueError: there is no such model, or it refuses the medium.
         """
         return bssrdf(model, self.medium)
-
-    def _accepted_by(self, model: str) -> bool:
-        try:
-            self.bssrdf(model)
-        except ValueError:
-            return False
-        return True
 
 
 def _check_fraction(name: str, value: object) -> None:
