@@ -20,6 +20,7 @@ from torch import nn
 
 from full_geometry.geometry.points import SurfacePoint
 from full_geometry.learning.meshes import TRAINING, Family, make_shape
+from full_geometry.learning.network_fitting import DenseLayers, NamedNetwork
 from full_geometry.objects.objects import TranslucentObject, object_of
 from full_geometry.transport.any_shape import ALBEDO, ETA, KIND, LEAST, PLACE_OF_G, SIZE, WEIGHTS, Backbone, G, most
 from full_geometry.transport.descriptors import (
@@ -84,38 +85,31 @@ class LearntShapes(NamedTuple):
     seconds: float
 
 
-class ShapeNetwork(nn.Module):
+class ShapeNetwork(NamedNetwork):
     """f of `NeuralShape` in torch; 0 initially."""
+
+    NAMES = ("W", "b")
 
     def __init__(self, recipe: ShapeRecipe, seed: int = 0) -> None:
         super().__init__()
-        generator = torch.Generator().manual_seed(seed)
         curved = len(range(N_OWN)[CURVED_OWN]) + len(range(N_SHARED)[CURVED_SHARED])
         sizes = [N_OWN + N_SHARED + N_MEDIUM, *[recipe.width] * recipe.depth, curved]
-        self.matrices, self.biases = nn.ParameterList(), nn.ParameterList()
-        for k, (i, j) in enumerate(zip(sizes, sizes[1:])):
-            gain = math.sqrt((1.0 if k == 0 else 2.0) / i) if k < recipe.depth else 0.0
-            self.matrices.append(gain * torch.randn(j, i, generator=generator))
-            self.biases.append(torch.zeros(j))
+        self.layers = DenseLayers(sizes, torch.Generator().manual_seed(seed))
 
     def forward(self, x: torch.Tensor, medium: torch.Tensor) -> torch.Tensor:
         """f (n,) of descriptors (n, numbers) and the numbers of media (n, 16)."""
         linear, swish = nn.functional.linear, nn.functional.hardswish
         o, i, shared = x[:, :N_OWN], x[:, N_OWN : 2 * N_OWN], x[:, 2 * N_OWN :]
-        W = self.matrices[0]
-        rest = linear(torch.cat((shared, medium), dim=1), W[:, N_OWN:], self.biases[0])
+        (W, *matrices), (b, *biases) = self.layers.matrices, (b[:, 0] for b in self.layers.biases)
+        rest = linear(torch.cat((shared, medium), dim=1), W[:, N_OWN:], b)
         h = swish(linear(o, W[:, :N_OWN]) + rest) + swish(linear(i, W[:, :N_OWN]) + rest)
-        for k in range(1, len(self.matrices)):
-            h = linear(h, self.matrices[k], self.biases[k])
-            h = swish(h) if k < len(self.matrices) - 1 else h
+        for k, (W, b) in enumerate(zip(matrices, biases)):
+            h = linear(h, W, b)
+            h = swish(h) if k < len(matrices) - 1 else h
         u = torch.cat((o[:, CURVED_OWN] + i[:, CURVED_OWN], shared[:, CURVED_SHARED]), dim=1)
         g = (h * torch.tanh(u)).sum(dim=1)
         bound = torch.where(g > 0, most(torch, medium[:, PLACE_OF_G]), -LEAST)
         return bound * torch.tanh(g / bound)
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        arrays = {f"W_{k}": W.detach().numpy().copy() for k, W in enumerate(self.matrices)}
-        return arrays | {f"b_{k}": b.detach().numpy().copy() for k, b in enumerate(self.biases)}
 
 
 def _halves(values: torch.Tensor, counts: list[int]) -> torch.Tensor:

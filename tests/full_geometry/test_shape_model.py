@@ -187,9 +187,7 @@ def test_torch_and_drjit_say_the_same() -> None:
     x = torch.from_numpy(np.stack(columns, axis=-1).astype(np.float32))
     network, model = ShapeNetwork(ShapeRecipe(width=16, depth=2)), NeuralShape.of(obj, weights)
     with torch.no_grad():
-        for k, (W, b) in enumerate(zip(network.matrices, network.biases)):
-            W.copy_(torch.from_numpy(weights[f"W_{k}"]))
-            b.copy_(torch.from_numpy(weights[f"b_{k}"]))
+        network.take(weights)
         wanted = network(x, torch.from_numpy(model.media[0]).expand(N, -1)).numpy()
     found = model._f(pair, model._media[0]).numpy()
     assert x.shape[1] == 2 * N_OWN + N_SHARED and len(model.media[0]) == N_MEDIUM
