@@ -29,7 +29,7 @@ import numpy as np
 from full_geometry.geometry.light_points import GOLDEN, SurfacePoints, lattice
 from full_geometry.geometry.points import cosine_above, floats, place, surface_point
 from full_geometry.geometry.rounding import ray_from
-from full_geometry.geometry.shape import analyse_shape, is_inside
+from full_geometry.geometry.shape import is_inside
 from full_geometry.geometry.snapshot import same_objects
 from full_geometry.integrators.gathering import Gathered, OutgoingLight, light_state
 from full_geometry.integrators.inner_light import cut_to_next
@@ -247,7 +247,7 @@ def _without_light(media: WalkMedia, k: int, scene: mi.Scene) -> TranslucentObje
     area = area_of(media, k)
     points = SurfacePoints.drawn(lambda u: entries(media, k, u), area, count_of(obj, area))
     p, hidden = np.array(points.p, dtype=float), np.zeros(len(points), dtype=bool)
-    for j, other in _around(media, scene):
+    for j, other in _around(media):
         if j != k:
             hidden |= is_inside(other[0], np.linalg.inv(other[1])[:3] @ np.vstack([p, np.ones(p.shape[1])]))
     if hidden.all():
@@ -261,18 +261,11 @@ def _without_light(media: WalkMedia, k: int, scene: mi.Scene) -> TranslucentObje
     return replace(obj, gathered=Gathered(obj, points, albedo, values, None))
 
 
-def _around(media: WalkMedia, scene: mi.Scene) -> list[tuple[int, tuple]]:
+def _around(media: WalkMedia) -> list[tuple[int, tuple]]:
     """The objects, and glass that overlaps them, by number, each with its geometry and the place where it stands."""
-    table = media.instance_table
-    found = [(k, (media.objects[int(table.kind[k])], to_world(media, k))) for k in range(len(table))]
-    if media.overlaps:
-        holders = media.inner.priorities.instance_table
-        for k in media.inner.priorities.members():
-            if k >= len(table):
-                kind = int(holders.kind[k])
-                place = holders.to_world(kind)[k - int(holders.first[kind])]
-                found.append((int(k), (analyse_shape(holders.shapes[kind], scene), place)))
-    return found
+    members = media.inner.priorities.members().tolist() if media.overlaps else []
+    numbers = {*range(len(media.instance_table)), *members}
+    return [(k, (media.holder_shapes[int(media.holders.kind[k])], to_world(media, k))) for k in sorted(numbers)]
 
 
 def _check(obj: TranslucentObject, settings: Settings, alone: bool) -> None:

@@ -30,16 +30,19 @@ from full_geometry.walk.emitter_connections import Departure, EmitterDirections,
 from full_geometry.walk.media import Coefficients, WalkMedia, WalkMedium, interaction_of, ray_of
 from full_geometry.walk.random_walk import (
     OUTSIDE,
+    Behind,
     Crossing,
     Event,
     Visitor,
     Walk,
     Walker,
+    behind_of,
     draw,
     draw_channel,
     eval_phase,
     pick,
     sample_bsdf,
+    skip,
     start_walk,
 )
 from full_geometry.walk.scores import PathScores, Score, ScoreVisitor, Stay, StayRecord
@@ -75,9 +78,9 @@ class LightRecord:
     run: ForwardRun | tuple[()] = ()  # where precomputed light has met forward events
     shallow: mi.Bool | tuple[()] = ()  # one event at most since the path went in, where deep light is told apart
 
-    def onward(self, k: mi.Int32) -> LightRecord:
-        """The record at the surface of object k, or of another surface, k < 0, whose light is not precomputed."""
-        return replace(self, known=self.known & (k >= 0), ended=self.ended & (k >= 0))
+    def onward(self, passed: mi.Bool) -> LightRecord:
+        """The record at a surface; `passed`: whether it is one of those that precomputed light comes by."""
+        return replace(self, known=self.known & passed, ended=self.ended & passed)
 
 
 class Seen(NamedTuple):
@@ -88,30 +91,6 @@ class Seen(NamedTuple):
     light: mi.Spectrum
     found: mi.Bool
     kept: mi.Spectrum
-
-
-class Behind(NamedTuple):
-    """What is behind a surface that a ray outside of objects has met, where something lies inside or overlaps.
-
-    Args:
-        member: whether the surface is a boundary to an object or in one.
-        object: the number of the object behind it, or OUTSIDE.
-        within: see `Walk.within`.
-        unlit: whether emitters are met by chance alone: a medium, or boundaries that are hidden, are between.
-    """
-
-    member: mi.Bool
-    bsdf: mi.BSDFPtr
-    object: mi.Int32
-    within: mi.UInt32 | tuple[()]
-    unlit: mi.Bool
-
-    def entered(self, walk: Walk, through: mi.Bool, k: mi.Int32, enters: mi.Bool) -> tuple[Walk, mi.Int32, mi.Bool]:
-        """The walk, the object that it is in and whether it has entered that, where it goes through the surface."""
-        if len(walk.within):
-            walk = replace(walk, within=dr.select(through, self.within, walk.within))
-        inside = through & (self.object >= 0)
-        return walk, dr.select(self.member, self.object, k), dr.select(self.member, inside, enters)
 
 
 @dataclass
@@ -307,8 +286,9 @@ class LightVisitor:
 
     @property
     def others(self) -> bool:
-        """Whether the scene has other surfaces than objects."""
-        return len(shapes_of(self.scene, self.media.shown)) > len(self.media.objects)
+        """Whether the scene has other surfaces than objects and glass in or over them."""
+        passed = {id(shape) for shape in self.media.refracting}
+        return any(id(shape) not in passed for shape in shapes_of(self.scene, self.media.shown))
 
     @property
     def forward(self) -> bool:
@@ -716,49 +696,27 @@ class PathTracer:
         alive = si.is_valid() & (depth < mi.UInt32(self.max_depth))
         walk, skips = replace(p.walk, alive=alive), mi.Bool(False)
         if len(walk.within):
-            walk, skips = self._skip(walk, si)
+            walk, skips = skip(self.visitor.media, walk, si)
             depth, alive = dr.select(skips, p.depth, depth), alive & ~skips
         p = replace(p, walk=walk, light=light, hit=p.hit | (first & si.is_valid()), depth=depth)
         return dr.if_stmt((p, si), alive, self._bounce, lambda p, si: p, label="bounce")
-
-    def _skip(self, walk: Walk, si: mi.SurfaceInteraction3f) -> tuple[Walk, mi.Bool]:
-        """The walk behind a boundary that a higher priority hides, and whether it has met one."""
-        media = self.visitor.media
-        si = media.face_outwards(si, media.index_of(si, si.is_valid()), walk.d)
-        met = media.inner.priorities.meet(si, walk.d, walk.within)
-        skips = walk.alive & met.passes
-        o, _ = media.depart(si, walk.d, mi.Bool(False))
-        return replace(walk, o=dr.select(skips, o, walk.o), within=dr.select(skips, met.within, walk.within)), skips
-
-    def _behind(self, walk: Walk, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, translucent: mi.Bool) -> Behind:
-        """Glass inside an object seen from within, which has that behind it, and boundaries of things that overlap."""
-        inner = self.visitor.media.inner
-        around = inner.around(si)
-        encloses = ~translucent & (around >= 0) & inner.displaces(si) & (dr.dot(walk.d, si.n) > 0)
-        if not len(walk.within):
-            return Behind(encloses, bsdf, around, (), encloses)
-        met = inner.priorities.meet(si, walk.d, walk.within)
-        pairs = ((met.bsdf, bsdf), (met.object, around), (met.within, walk.within))
-        return Behind(
-            encloses | met.member, *(dr.select(met.member, a, b) for a, b in pairs), encloses | (walk.within != 0)
-        )
 
     def _bounce(self, p: CameraPath, si: mi.SurfaceInteraction3f) -> CameraPath:
         """A surface met from outside: next-event estimation, BSDF sampling, Russian roulette, the way on or in."""
         # ---- what masks leave: the boundary of object k or another BSDF
         walk, media, rng = p.walk, self.visitor.media, p.walk.rng
         k, bsdf, si, mute = self._drawn(p, si)
-        translucent, near, light = k >= 0, dr.maximum(k, 0), p.light.onward(k)
-        lit = ~(mute | light.known)
-        behind, outer = None if media.inner is None else self._behind(walk, si, bsdf, translucent), translucent
+        translucent, near = k >= 0, dr.maximum(k, 0)
+        behind, outer = None if media.inner is None else behind_of(media, walk, si, bsdf, translucent), translucent
         if behind is not None:
-            bsdf, lit, outer = behind.bsdf, lit & ~behind.unlit, translucent | behind.member
+            bsdf, outer = behind.bsdf, translucent | behind.member
+        light, held = p.light.onward(outer), translucent & (p.depth == 1)
+        lit = ~(mute | light.known | (behind.unlit if behind is not None else False))
 
         # ---- next-event estimation: L += throughput f cos L_e / p_e  p_e / (p_e + p_f)
         L = light.L + self.visitor.sampled_emitter(walk, si, bsdf, lit, outer)
 
         # ---- deep light that is known: L += throughput a C.Y
-        held = translucent & (p.depth == 1)
         if self.visitor.outgoing is not None:
             held, deep = self.visitor.outgoing.radiance(si, near, -walk.d, _in_air(translucent, behind))
             L = L + walk.weight * deep
@@ -773,7 +731,7 @@ class PathTracer:
         enters = translucent & (dr.dot(d, si.n) < 0)
         weight, scale = walk.weight * value * mirrored.kept, walk.scale * dr.square(bs.eta)
 
-        # ---- Russian roulette: survive with q = min(size, 0.95), throughput /= q
+        # ---- Russian roulette: survive with q = min(size, 0.99), throughput /= q
         survive = survival(dr.max(weight) * scale, p.depth, self.rr_depth)
         alive = (bs.pdf > 0) & (dr.max(weight) > 0) & (rng.next_float32() < survive) & ~(mute & ~enters)
 

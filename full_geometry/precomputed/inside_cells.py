@@ -4,8 +4,8 @@ Light that has not scattered reaches a few mean free paths deep. Bricks of 4³ c
 the surface is nearer than that, and a table of all bricks tells which: an object of hundreds of mean free paths has as
 many cells as its surface is large. Bricks beyond the first few mean free paths have 2³ cells of edge 2 h.
 
-The inside is that of the surface without the shapes that lie in it. A cell that one of these surfaces cuts holds a part
-of it only. A function on the cells that is linear in each, least
+The inside is that of the surface without the shapes that lie in it, and without what of larger priority overlaps it. A
+cell that one of these surfaces cuts holds a part of it only. A function on the cells that is linear in each, least
 squares over the inside, needs the moments of that part,
 
     m_jk = ∫_inside x_j x_k dx / h³,    x = (1, x, y, z),
@@ -120,9 +120,10 @@ class InsideCells:
         low = 0.5 * (box[0] + box[1]) - 0.5 * BRICK * counts * h
         held = partial(_points_held, media, k, box)
         outer, inner = (_crossed_bricks(each, low, h, counts) for each in (points, held))
-        apart = distance_transform_cdt(~outer.reshape(counts[::-1]), "chessboard").ravel()
-        near, far = (np.ceil(min(depth / (BRICK * h), 1e6)) for depth in depths)
         surface = outer | inner
+        lit = surface if media.overlaps else outer  # light enters from what overlaps, too
+        apart = distance_transform_cdt(~lit.reshape(counts[::-1]), "chessboard").ravel()
+        near, far = (np.ceil(min(depth / (BRICK * h), 1e6)) for depth in depths)
         bricks = np.flatnonzero(surface & (apart <= far))
         axes = _crossed_cells((points, held), low, h, counts, bricks)
 
@@ -343,7 +344,7 @@ def _points_held(media: WalkMedia, k: int, box: tuple[np.ndarray, np.ndarray], d
                 dr.eval(o)
                 si = media.instance_scene.intersect(media.inner.scene, mi.Ray3f(o, d), mi.RayFlags.Minimal, going)
                 going &= si.is_valid() & (dr.dot(si.p, d) < end)
-                held = going & (media.inner.around(si) == dr.opaque(mi.Int32, k))
+                held = going & _bounds(media, dr.opaque(mi.Int32, k), si)
                 p, n_met = dr.select(held, si.p, low - opaque(np.max(size))), mi.Normal3f(si.n)
                 o = dr.select(going, si.p + d * opaque(STEP / root), o)
                 dr.eval(p, n_met, o, going)
@@ -408,12 +409,25 @@ def _points(x: np.ndarray, low: np.ndarray, h: float) -> mi.Point3f:
     return of_rows(mi.Point3f, low + h * x)
 
 
+def _bounds(media: WalkMedia, k: mi.Int32, si: mi.SurfaceInteraction3f) -> mi.Bool:
+    """Whether what a ray has met is a shape in object k, or may overlap that."""
+    held = media.inner.around(si) == k
+    if not media.overlaps:
+        return held
+    of, number = media.inner.priorities, media.inner.priorities.instance_table.number(si, si.is_valid())
+    return held | (of.bit_of(number, mi.Bool(True)) != 0) & (number != k)
+
+
 def _ahead(media: WalkMedia, k: mi.Int32, ray: mi.Ray3f) -> tuple[mi.Float, mi.Bool, mi.Bool]:
     """Distance to the next surface that bounds the inside of object k along a ray, whether there is one, and whether
-    the ray is inside up to there: the next boundary of the object lets it out, and none of a shape in it does."""
+    the ray is inside up to there: the next boundary of the object lets it out, and none of a shape in it, or of what
+    has a larger priority, does."""
     scene = (media.inner or media).scene
 
-    def nearer(t: mi.Float, first: mi.Float, inside: mi.Bool, met: mi.UInt32, going: mi.Bool) -> tuple:
+    def nearer(
+        t: mi.Float, first: mi.Float, inside: mi.Bool, met: mi.UInt32, around: mi.UInt32, seen: mi.UInt32,
+        going: mi.Bool,
+    ) -> tuple:  # fmt: skip
         # ---- the next surface; its first meeting with the object, bit 1 of `met`, tells whether it was in there
         here = mi.Ray3f(ray.o + ray.d * t, ray.d)
         si = media.instance_scene.intersect(scene, here, mi.RayFlags.Minimal, active=going)
@@ -428,17 +442,29 @@ def _ahead(media: WalkMedia, k: mi.Int32, ray: mi.Ray3f) -> tuple[mi.Float, mi.B
             held = hit & (media.inner.around(si) == k)
             number = media.inner.instance_table.number(si, hit)
             side = dr.gather(mi.Float, media.holes.side, dr.maximum(number, 0), held)
+            if media.overlaps:
+                # ---- that with each thing that overlaps tells whether it was in there
+                of = media.inner.priorities
+                bit = of.bit_of(of.instance_table.number(si, hit), hit)
+                outwards = media.face_outwards(si, media.index_of(si, hit), ray.d)
+                around |= dr.select(dr.dot(outwards.n, ray.d) > 0, bit & ~seen, 0)
+                seen, held = seen | bit, held & (bit == 0)
+                bounds |= bit != 0
             inside &= ~held | (met & 2 != 0) | (along * side <= 0)
             met |= dr.select(held & (side != 0), mi.UInt32(2), 0)
-            bounds, last = own | held, met == 3
+            bounds, last = bounds | held, mi.Bool(False) if media.overlaps else met == 3
         first = dr.select(bounds & ~dr.isfinite(first), t, first)
-        return dr.select(hit, t + media.row("rounding", k), t), first, inside, met, hit & ~last
+        return dr.select(hit, t + media.row("rounding", k), t), first, inside, met, around, seen, hit & ~last
 
     lanes = dr.width(ray.o)
-    t, first, met = dr.zeros(mi.Float, lanes), dr.full(mi.Float, dr.inf, lanes), dr.full(mi.UInt32, 0, lanes)
-    state = t, first, dr.full(mi.Bool, True, lanes), met, dr.full(mi.Bool, True, lanes)
-    _, first, inside, met, _ = dr.while_loop(state, lambda *state: state[-1], nearer, label="surfaces ahead")
-    return first, dr.isfinite(first), inside & (met & 1 != 0)
+    t, first, yes = dr.zeros(mi.Float, lanes), dr.full(mi.Float, dr.inf, lanes), dr.full(mi.Bool, True, lanes)
+    state = t, first, yes, *(dr.zeros(mi.UInt32, lanes) for _ in range(3)), mi.Bool(yes)
+    _, first, inside, met, around, _, _ = dr.while_loop(state, lambda *s: s[-1], nearer, label="surfaces ahead")
+    inside &= met & 1 != 0
+    if media.overlaps:
+        own = media.inner.priorities.bit_of(k, mi.Bool(True))
+        inside &= (own == 0) | (around >> 1 < own)  # its bit is the highest
+    return first, dr.isfinite(first), inside
 
 
 def _starts_inside(media: WalkMedia, k: int, p: mi.Point3f) -> np.ndarray:
@@ -515,15 +541,17 @@ def _parents(cells: np.ndarray, volume: np.ndarray, counts: np.ndarray) -> tuple
     ordered = number[order]
     parent, offset = np.arange(len(cells)), np.zeros((len(cells), 3), dtype=np.float32)
     small = np.flatnonzero(volume < SMALLEST)
-    best = np.full(len(small), SMALLEST)
 
-    # ---- the largest of six
-    for axis in range(3):
-        for step in (-1, 1):
-            wanted = number[small] + step * strides[axis]
+    # ---- the largest of six, else of all 26 around it
+    around = np.array([step for step in itertools.product((-1, 0, 1), repeat=3) if any(step)])
+    for steps in (around[np.abs(around).sum(axis=1) == 1], around):
+        best = np.full(len(small), SMALLEST)
+        for step in steps:
+            wanted = number[small] + step @ strides
             at = np.searchsorted(ordered, wanted).clip(max=len(cells) - 1)
             size = np.where(ordered[at] == wanted, volume[order[at]], 0)
             better = size > best
             best[better], parent[small[better]] = size[better], order[at[better]]
-            offset[small[better]] = -step * (np.arange(3) == axis)
+            offset[small[better]] = -step
+        small = small[parent[small] == small]
     return parent, offset

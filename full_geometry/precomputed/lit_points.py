@@ -21,7 +21,7 @@ R_4 = (0.8566748838545029, 0.7338918566271260, 0.6287067210378087, 0.53859725722
 def lit_points(
     scene: mi.Scene, media: WalkMedia, k: int, rays: int, seed: tuple[int, ...], rng: mi.PCG32
 ) -> tuple[mi.SurfaceInteraction3f, mi.Spectrum]:
-    """Points in order along the faces of object k, as a direction w to an emitter sees them, and their flux.
+    """Points in order along the faces of object or glass k, as a direction w to an emitter sees them, and their flux.
 
     Paths from the camera find the light L cos(w, n_s) f / |d.n_s| for each radiance along d; behind the boundary a ray
     has the flux
@@ -57,7 +57,7 @@ def _incident(
     """A direction w to an emitter, and the light from there over its density.
     A share of them is drawn by the cosine, for lamps so near that those of the emitters miss them (balance heuristic
     over one sample): L / ((1 - BY_COSINE) p_emitter + BY_COSINE p_cosine)."""
-    instance_scene, rounding = media.instance_scene, media.row("rounding", mi.Int32(k))
+    instance_scene, rounding = media.instance_scene, opaque(media.holders.rounding[k])
 
     # ---- by the emitters, L without its density; delta lights have no other technique
     ds, light = scene.sample_emitter_direction(si, u, False)
@@ -94,16 +94,18 @@ def multiples(roots: tuple[float, ...], shift: Iterable[float], width: int, firs
 
 
 def to_world(media: WalkMedia, k: int) -> np.ndarray:
-    """Where object k stands: the matrix of an instance."""
-    kind = int(media.instance_table.kind[k])
-    return media.instance_table.to_world(kind)[k - int(media.instance_table.first[kind])]
+    """Where object or glass k stands: the matrix of an instance."""
+    table = media.holders
+    kind = int(table.kind[k])
+    return table.to_world(kind)[k - int(table.first[kind])]
 
 
 def entries(media: WalkMedia, k: int, u: list[mi.Float]) -> EntrySample:
-    """Points uniform over the surface of object k, in an instance over that in its group; the weight is 1 / density."""
-    kind = int(media.instance_table.kind[k])
-    found = uniform_entries(media.objects[kind], u[0], mi.Point2f(u[1], u[2]))
-    if media.instance_table.groups[kind] is None:
+    """Points uniform over the surface of object or glass k, in an instance over that in its group.
+    The weight is 1 / density."""
+    kind = int(media.holders.kind[k])
+    found = uniform_entries(media.holder_shapes[kind], u[0], mi.Point2f(u[1], u[2]))
+    if media.holders.groups[kind] is None:
         return found
     M = to_world(media, k)
     columns = [[mi.Vector3f(*(opaque(v) for v in column)) for column in m[:3].T] for m in (M, np.linalg.inv(M))]

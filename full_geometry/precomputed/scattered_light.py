@@ -10,11 +10,11 @@ bring both to the cells, once for an image. At event FEW of a stay in an object 
 and ends. Events before that one add L_0 + L_u. So each path is found once: one of fewer than FEW events since the
 camera's path entered at the last of them, all others at event FEW.
 
-A path of light begins as rays of unscattered light do, but may also be reflected there. It walks through objects and
-between them. Each of its events adds the weight with which it arrives over sigma_s, the estimate of ∫ L dw dx by
-collisions, but for those that L_0 holds: the first event of a path that has met nothing but the boundary of its first
-object. Light by way of other surfaces than objects and those in them is left to paths from the camera: a share of them
-goes on for that.
+A path of light begins as rays of unscattered light do, or at glass that overlaps objects, and may also be reflected
+there. It walks through objects and between them, and through glass in or over them. Each of its events adds the weight
+with which it arrives over sigma_s, the estimate of ∫ L dw dx by collisions, but for those that L_0 holds: the first
+event of a path that has met nothing but the boundary of its first object. Light by way of other surfaces is left to
+paths from the camera: a share of them goes on for that.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ import mitsuba as mi
 from full_geometry.geometry.points import lane_numbers, opaque, sided
 from full_geometry.precomputed.inside_cells import CellIndex
 from full_geometry.precomputed.lit_points import bend, lit_points
+from full_geometry.walk.emission import MOST_SURVIVAL
 from full_geometry.walk.media import WalkMedia
 from full_geometry.walk.random_walk import (
     OUTSIDE,
@@ -38,9 +39,11 @@ from full_geometry.walk.random_walk import (
     Visitor,
     Walk,
     Walker,
+    behind_of,
     draw_channel,
     on_device,
     sample_bsdf,
+    skip,
     start_walk,
 )
 from halfspace_sss.tracing.walk import generator, pass_seed
@@ -77,18 +80,20 @@ class ScatteredLight(Visitor):
     slots: int
 
     def trace(self, k: int, number: int, seed: int) -> None:
-        """Add the light of so many paths that begin on object k, or a few more."""
+        """Add the light of so many paths that begin on object or glass k, or a few more."""
         parts = math.ceil(number / AT_ONCE)
         for part in range(parts):
             self._trace(self._starts(k, math.ceil(number / parts), parts, (seed, k, part)), (seed, k, part))
 
     def _starts(self, k: int, number: int, parts: int, seed: tuple[int, ...]) -> tuple:
-        """Where paths of about equal flux begin: o, d, off, object, whether there is light, and the path."""
+        """Where paths of about equal flux begin: o, d, off, object, `Walk.within`, whether there is light, the path."""
         # ---- points of the surface with a sample of the emitters, refracted or reflected there: flux *= f cos / p
         many = CANDIDATES * number
         rng = generator(mi, many, pass_seed(*seed, 1))
         si, flux = lit_points(self.scene, self.media, k, many, (*seed, 1), rng)
-        bs, value = sample_bsdf(self.media.boundary(k), si, rng, mi.BSDFContext(mi.TransportMode.Importance))
+        glass = k >= len(self.media.instance_table)
+        boundary = self.media.inner.priorities.boundary(k) if glass else self.media.boundary(k)
+        bs, value = sample_bsdf(boundary, si, rng, mi.BSDFContext(mi.TransportMode.Importance))
         d, _ = sided(si, bs.wo)
         enters = dr.dot(d, si.n) < 0
         flux = dr.select(bs.pdf > 0, flux * value * bend(si, bs.wo, d), 0)
@@ -104,7 +109,12 @@ class ScatteredLight(Visitor):
         which = dr.binary_search(0, many - 1, lambda i: dr.gather(type(ends), ends, i) < at)
         o, d, off, enters, flux, size = dr.gather(tuple, (o, d, off, enters, flux, size), which)
         flux = dr.select(size > 0, flux * (opaque(total / (number * parts)) / dr.maximum(size, 1e-30)), 0)
-        return o, d, off, dr.select(enters, mi.Int32(k), OUTSIDE), size > 0, LightPath(flux, enters, enters & False)
+        within: mi.UInt32 | tuple[()] = ()
+        if self.media.overlaps:
+            within = dr.select(enters, self.media.inner.priorities.start(dr.opaque(mi.UInt32, k)), mi.UInt32(0))
+        inside = enters & (not glass)
+        path = LightPath(flux, inside, enters & False)
+        return o, d, off, dr.select(inside, mi.Int32(k), OUTSIDE), within, size > 0, path
 
     def _trace(self, starts: tuple, seed: tuple[int, ...]) -> None:
         """Walk from so many starts; lanes take those of index, index + lanes, ... until none is left."""
@@ -116,9 +126,9 @@ class ScatteredLight(Visitor):
 
         def begin(index: mi.UInt32, rng: mi.PCG32) -> tuple[Walk, LightPath]:
             known = index < total
-            o, d, off, k, alive, path = dr.gather(tuple, starts, index, known)
+            o, d, off, k, within, alive, path = dr.gather(tuple, starts, index, known)
             channel, density = draw_channel(self.media.shares(dr.maximum(k, 0)), rng.next_float32())
-            walk = replace(start_walk(o, d, rng), off=off, object=k, alive=alive & known)
+            walk = replace(start_walk(o, d, rng), off=off, object=k, alive=alive & known, within=within)
             return replace(walk, channel=channel, density=density), path
 
         def renew(walk: Walk, index: mi.UInt32, path: LightPath) -> tuple[Walk, mi.UInt32, LightPath]:
@@ -137,21 +147,44 @@ class ScatteredLight(Visitor):
         dr.eval(self.D)
 
     def _outside(self, walk: Walk) -> tuple[Walk]:
-        """A ray between objects, as far as another or the same one, which reflects it or lets it in."""
+        """A ray between objects, as far as the next surface, which passes or ends it."""
         media = self.media
         si = media.instance_scene.intersect(self.scene, mi.Ray3f(walk.o, walk.d), mi.RayFlags.All)
-        k = media.index_of(si, si.is_valid())
-        met = k >= 0
-        k = dr.maximum(k, 0)
+        if not len(walk.within):
+            return self._bounce(walk, si)
+        walk, skips = skip(media, walk, si)
+        return dr.if_stmt((walk, si), ~skips, self._bounce, lambda walk, si: (walk,), label="bounce")
+
+    def _bounce(self, walk: Walk, si: mi.SurfaceInteraction3f) -> tuple[Walk]:
+        """An object, or glass in or over one, reflects a ray or lets it in."""
+        # ---- the object whose outside is met, or what is behind glass
+        media, k = self.media, self.media.index_of(si, si.is_valid())
+        translucent, near = k >= 0, dr.maximum(k, 0)
         si = media.seen(si, k, walk.d)
-        bs, value = sample_bsdf(media.boundary(k), si, walk.rng)
+        bsdf, passed, behind = media.boundary(near), translucent & (dr.dot(si.n, walk.d) < 0), None
+        if media.inner is not None:
+            bsdf = dr.select(translucent, media.boundary_pointer(near), si.bsdf())
+            behind = behind_of(media, walk, si, bsdf, translucent)
+            bsdf, passed = behind.bsdf, passed | behind.member
+
+        # ---- weight *= f cos / p and what light has beyond the camera's paths
+        bs, value = sample_bsdf(bsdf, si, walk.rng)
         d, _ = sided(si, bs.wo)
-        enters = dr.dot(d, si.n) < 0
+        weight, alive = walk.weight, passed & (bs.pdf > 0)
+        enters = translucent & (dr.dot(d, si.n) < 0)
+        if behind is not None:
+            # glass keeps light by total reflection, without roulette for ever
+            d = dr.select(translucent, d, si.to_world(bs.wo))
+            through = behind.member & (dr.dot(d, si.n) * dr.dot(walk.d, si.n) > 0)
+            alive &= ~behind.member | (walk.rng.next_float32() < MOST_SURVIVAL)
+            weight = dr.select(behind.member, weight / MOST_SURVIVAL, weight)
+            walk, near, enters = behind.entered(walk, through, near, enters)
+        weight = weight * value * adjoint(si, walk.d, d)
+
+        # ---- the way on
         o, off = media.depart(si, d, enters)
-        alive = met & (bs.pdf > 0) & (dr.dot(si.n, walk.d) < 0)
-        weight = walk.weight * value * adjoint(si, walk.d, d)
         return (replace(walk, o=o, d=d, off=off, alive=alive, order=mi.UInt32(0) & walk.order,
-                        object=dr.select(alive & enters, k, OUTSIDE), weight=weight,
+                        object=dr.select(alive & enters, near, OUTSIDE), weight=weight,
                         scale=walk.scale * dr.square(bs.eta)),)  # fmt: skip
 
     # ---- visitor of walks

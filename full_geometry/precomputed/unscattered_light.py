@@ -168,8 +168,9 @@ def _with_paths(
     D = dr.zeros(mi.Float, 2 * n * slots)
     dr.eval(D)
     tracer = ScatteredLight(scene, media, light.index, light.tables, D, slots)
-    for k in np.flatnonzero(~np.array(media.enclosed(dr.arange(mi.Int32, len(cells))))).tolist():
-        tracer.trace(k, max(paths // len(cells), FEWEST_PATHS), seed)
+    starts = media.lit_from_outside
+    for k in starts:
+        tracer.trace(k, max(paths // len(starts), FEWEST_PATHS), seed)
 
     # ---- the fit of each: L_s, then L_u, which has not scattered
     parts, first = [], 0
@@ -211,8 +212,6 @@ def obstacle(media: WalkMedia) -> str:
     """Why light of a scene must be sampled; "" where it can be precomputed."""
     if mi.is_spectral:
         return f"the variant {mi.variant()} has no light by channel"
-    if media.overlaps:
-        return "objects overlap"
     if media.inner is not None:
         try:
             media.holes  # noqa: B018
@@ -316,6 +315,7 @@ class _Ray:
     density: mi.Spectrum  # of the flights so far by each channel, over the mean
     alive: mi.Bool
     rng: mi.PCG32
+    within: mi.UInt32 | tuple[()] = ()  # what is around it, where things overlap, see `walk.priorities`
 
 
 @dataclass(frozen=True, eq=False)
@@ -354,6 +354,7 @@ class _Rays:
         return _Ray(
             o=mi.Point3f(si.p), d=d, off=media.clear(self.k, si.n, d), flux=mi.Spectrum(flux), T=T,
             entered=dr.max(flux), channel=channel, density=mi.Spectrum(T), alive=mi.Bool(enters), rng=rng,
+            within=media.inner.priorities.start(mi.UInt32(self.k)) if media.overlaps else (),
         )  # fmt: skip
 
     def segment(self, ray: _Ray) -> _Ray:
@@ -375,14 +376,21 @@ class _Rays:
         """Reflection at the surface, where the ray arrives with the transmittance T."""
         media, d, rng = self.media, ray.d, ray.rng
 
-        # ---- reflection: flux F, with roulette; behind an object that overlaps the ray goes on, and behind its own
-        # boundary if rounding has put it outside; a shape in the object ends it
-        met = media.met(si, self.k) == self.k
-        if media.inner is not None:
-            alive = alive & (media.inner.around(si) != self.k)
-        si = media.seen(si, self.k, d)
+        # ---- what is met: behind boundaries that a higher priority hides the ray goes on, and behind its own if
+        # rounding has put it outside; a shape in the object ends it
+        met, within = media.met(si, self.k) == self.k, ray.within
+        boundary = media.boundary(self.k)
+        ends = mi.Bool(False) if media.inner is None else media.inner.around(si) == self.k
+        si = media.seen(si, media.index_of(si) if media.overlaps else self.k, d)
         own = met & (dr.dot(si.n, d) > 0)
-        bs, value = sample_bsdf(media.boundary(self.k), si, rng, _only(mi.BSDFFlags.Reflection))
+        if media.overlaps:
+            of = media.inner.priorities.meet(si, d, within)
+            own, ends = own & ~of.passes, dr.select(of.member, ~of.passes & ~met, ends)
+            boundary = dr.select(of.member & ~of.passes, of.bsdf, boundary)
+            within = dr.select(of.member & of.passes, of.within, within)
+
+        # ---- reflection: flux F, with roulette
+        bs, value = sample_bsdf(boundary, si, rng, _only(mi.BSDFFlags.Reflection))
         new, _ = sided(si, bs.wo)
         left = dr.max(dr.abs(ray.flux * value * T)) / dr.maximum(ray.entered, 1e-30)
         survive = dr.minimum(left / ROULETTE, 1)
@@ -391,7 +399,7 @@ class _Rays:
         flux = dr.select(own, ray.flux * value / dr.maximum(survive, 1e-20), ray.flux)
         return replace(
             ray, o=mi.Point3f(si.p), d=d, off=media.clear(self.k, si.n, d), flux=flux, T=T,
-            alive=alive & (~own | reflected),
+            alive=alive & ~ends & (~own | reflected), within=within,
         )  # fmt: skip
 
     def _fly(self, ray: _Ray, si: mi.SurfaceInteraction3f, far: mi.Float, alive: mi.Bool) -> _Ray:
@@ -422,8 +430,9 @@ class _Rays:
             flux=flux / dr.maximum(survive, 1e-20), density=density, alive=alive,
         )  # fmt: skip
         a, b = vars(at_event), vars(at_surface)
-        state = {key: dr.select(scatters, a[key], b[key]) for key in a if key != "rng"}
-        return _Ray(**state, rng=rng)
+        state = {key: dr.select(scatters, a[key], b[key]) for key in a if key not in ("rng", "within")}
+        within = dr.select(scatters, ray.within, at_surface.within) if len(ray.within) else ()
+        return _Ray(**state, rng=rng, within=within)
 
     def _collide(self, ray: _Ray, t: mi.Float, far: mi.Float, alive: mi.Bool) -> tuple:
         """The distance of the first collision that is not null, where a medium varies, the flux and density there or at

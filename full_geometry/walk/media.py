@@ -58,7 +58,8 @@ class InclusionTable:
         scene: a Mitsuba scene that holds the objects, and the shapes inside or partly inside them.
         instance_table: numbers of these shapes and of their instances.
         tables: by these numbers, the number of the object `around` a shape or -1, and whether it `displaces` that; by
-            the number of an object, whether it stands `alone`, neither in another nor around anything.
+            the number of an object, whether it stands `alone`, neither in another nor around anything, and whether it
+            is `enclosed` by another and overlaps nothing.
         lights: the delta lights in the medium of an object, and its number.
         priorities: of what overlaps; None where nothing does.
     """
@@ -111,10 +112,12 @@ class InclusionTable:
 
         # ---- tables of the kernel
         displaces = [_displaces(shape) for shape in instance_table.shapes]
-        alone = ~holding & ~held[: len(own)]
+        alone, enclosed = ~holding & ~held[: len(own)], held[: len(own)].copy()
         if priorities is not None:
-            alone[[k for k in priorities.members() if k < len(own)]] = False
+            members = [k for k in priorities.members() if k < len(own)]
+            alone[members] = enclosed[members] = False
         tables = {"around": mi.Int32(around.tolist()), "alone": mi.Bool(alone.tolist())}
+        tables["enclosed"] = mi.Bool(enclosed.tolist())
         tables["displaces"] = mi.Bool([displaces[kind] for kind in instance_table.kind])
         dr.make_opaque(tables)
         lights = [(light, k) for light, k in lights.values() if is_delta(light) and k >= 0]
@@ -448,8 +451,32 @@ class WalkMedia:
         return replace(self, specs=[each.spec for each in surfaces], boundaries=[each.boundary for each in surfaces])
 
     def enclosed(self, k: mi.Int32) -> mi.Bool:
-        """Whether object k lies inside another."""
-        return (k < 0) if self.inner is None else dr.gather(mi.Int32, self.inner.tables["around"], k) >= 0
+        """Whether object k lies inside another and overlaps nothing: light comes to it by way of that alone."""
+        return (k < 0) if self.inner is None else dr.gather(mi.Bool, self.inner.tables["enclosed"], k)
+
+    @property
+    def holders(self) -> InstanceTable:
+        """Numbers of the objects, then of the glass that overlaps them."""
+        return self.inner.priorities.instance_table if self.overlaps else self.instance_table
+
+    @cached_property
+    def holder_shapes(self) -> list[Geometry]:
+        """The shapes of these."""
+        glass = self.holders.shapes[len(self.objects) :]
+        return [*self.objects, *(analyse_shape(shape, self.scene) for shape in glass)]
+
+    @property
+    def lit_from_outside(self) -> list[int]:
+        """Numbers of the objects and glass at which scattered light may begin."""
+        objects = np.flatnonzero(~np.array(self.enclosed(dr.arange(mi.Int32, len(self.instance_table)))))
+        glass = [k for k in self.inner.priorities.members() if k >= len(self.instance_table)] if self.overlaps else []
+        return [*objects.tolist(), *map(int, glass)]
+
+    @property
+    def refracting(self) -> list[mi.Shape]:
+        """The objects, and the glass in or over them."""
+        inside = [] if self.inner is None else filter(_displaces, self.inner.instance_table.shapes)
+        return [*self.holders.shapes, *inside]
 
     @cached_property
     def holes(self) -> Holes | None:

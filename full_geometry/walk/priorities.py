@@ -122,11 +122,18 @@ class Priorities:
         """What is around a walk that begins at the surface of object k, which lies in no other."""
         return dr.gather(mi.UInt32, self.tables["bit"], k)
 
+    def boundary(self, k: int) -> mi.BSDF:
+        """The boundary of member k to what is outside of all."""
+        return self.boundaries[int(self.tables["boundary"][k])]
+
+    def bit_of(self, number: mi.Int32, active: mi.Bool) -> mi.UInt32:
+        """The bit of a thing by its number, which may be -1; 0 of what is no member."""
+        return dr.gather(mi.UInt32, self.tables["bit"], dr.maximum(number, 0), active & (number >= 0))
+
     def meet(self, si: mi.SurfaceInteraction3f, d: mi.Vector3f, within: mi.UInt32) -> Meeting:
         """What a ray along d has met; the normal at `si` is on the outside of objects."""
         number = self.instance_table.number(si, si.is_valid())
-        near = dr.maximum(number, 0)
-        bit = dr.gather(mi.UInt32, self.tables["bit"], near, number >= 0)
+        near, bit = dr.maximum(number, 0), self.bit_of(number, mi.Bool(True))
         member = bit != 0
 
         # ---- bits behind it: set on the way in, cleared on the way out; others on top of it hide it

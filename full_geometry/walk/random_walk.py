@@ -443,6 +443,58 @@ def draw(n: int, rng: mi.PCG32) -> mi.UInt32:
     return below(n, rng.next_float32())
 
 
+# ---- Surfaces met from outside, where something lies inside or overlaps ---------------------------------------------
+
+
+class Behind(NamedTuple):
+    """What is behind a surface that a ray outside of objects has met, where something lies inside or overlaps.
+
+    Args:
+        member: whether the surface is a boundary to an object or in one.
+        object: the number of the object behind it, or OUTSIDE.
+        within: see `Walk.within`.
+        unlit: whether emitters are met by chance alone: a medium, or boundaries that are hidden, are between.
+    """
+
+    member: mi.Bool
+    bsdf: mi.BSDFPtr
+    object: mi.Int32
+    within: mi.UInt32 | tuple[()]
+    unlit: mi.Bool
+
+    def entered(self, walk: Walk, through: mi.Bool, k: mi.Int32, enters: mi.Bool) -> tuple[Walk, mi.Int32, mi.Bool]:
+        """The walk, the object that it is in and whether it has entered that, where it goes through the surface."""
+        if len(walk.within):
+            walk = replace(walk, within=dr.select(through, self.within, walk.within))
+        inside = through & (self.object >= 0)
+        return walk, dr.select(self.member, self.object, k), dr.select(self.member, inside, enters)
+
+
+def behind_of(
+    media: WalkMedia, walk: Walk, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, translucent: mi.Bool
+) -> Behind:
+    """Glass inside an object seen from within, which has that behind it, and boundaries of things that overlap."""
+    inner = media.inner
+    around = inner.around(si)
+    encloses = ~translucent & (around >= 0) & inner.displaces(si) & (dr.dot(walk.d, si.n) > 0)
+    if not len(walk.within):
+        return Behind(encloses, bsdf, around, (), encloses)
+    met = inner.priorities.meet(si, walk.d, walk.within)
+    pairs = ((met.bsdf, bsdf), (met.object, around), (met.within, walk.within))
+    return Behind(
+        encloses | met.member, *(dr.select(met.member, a, b) for a, b in pairs), encloses | (walk.within != 0)
+    )
+
+
+def skip(media: WalkMedia, walk: Walk, si: mi.SurfaceInteraction3f) -> tuple[Walk, mi.Bool]:
+    """The walk behind a boundary that a higher priority hides, and whether it has met one."""
+    si = media.face_outwards(si, media.index_of(si, si.is_valid()), walk.d)
+    met = media.inner.priorities.meet(si, walk.d, walk.within)
+    skips = walk.alive & met.passes
+    o, _ = media.depart(si, walk.d, mi.Bool(False))
+    return replace(walk, o=dr.select(skips, o, walk.o), within=dr.select(skips, met.within, walk.within)), skips
+
+
 # ---- Walks from given points ----------------------------------------------------------------------------------------
 #
 # What a model of the light transport of an object is learnt from. A walk enters at x_o against the direction w_o and

@@ -63,7 +63,9 @@ def test_precomputed_light_has_the_mean_of_sampled_light(file: str) -> None:
 @pytest.mark.parametrize("file", WALKED)
 def test_nothing_that_does_not_absorb_is_seen_in_uniform_light(file: str) -> None:
     """Models refuse what lies inside or overlaps: walks see 1 everywhere where nothing is lost."""
-    scene, seen = _scene(file, "path_traced", "auto"), mi.load_dict({"type": "translucent_walk"})
+    # under even light the cells of milk, 90 000 of them, have more noise than walks
+    light = "sampled" if file == "milk" else "auto"
+    scene, seen = _scene(file, "path_traced", "auto"), mi.load_dict({"type": "translucent_walk", "light": light})
     known = mi.traverse(scene)
     for key in known.keys():
         if key.endswith("bsdf.albedo"):

@@ -115,6 +115,12 @@ def _held(kind: str, x: float = 1.0, radius: float = 2.0) -> dict:
     return {**_ball(radius, **place), "bsdf": surfaces[kind]}
 
 
+def _block() -> dict:
+    """Glass that fills the space below the middle of a ball of 5."""
+    to_world = mi.ScalarTransform4f().translate([0, -4, 0]).scale([8, 4, 8])
+    return {"type": "cube", "to_world": to_world, "bsdf": {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}}
+
+
 @pytest.mark.parametrize("kind", ["stone", "bubble", "medium", "sheet"])
 def test_cells_leave_out_what_lies_inside_an_object(kind: str) -> None:
     """A sheet has no volume."""
@@ -129,6 +135,26 @@ def test_cells_leave_out_the_part_of_an_eye_that_lies_inside_a_ball() -> None:
     _, _, edge, M = _moments(_cells(_ball(), held=eye))
     shared = np.pi * 2**2 * (5**2 + 2 * 5 * 7 - 3 * 3**2) / (12 * 5)
     assert (M[:, 0, 0] * edge**3).sum() == pytest.approx(4 / 3 * np.pi * 125 - shared, rel=5e-4)
+
+
+@pytest.mark.parametrize(("priority", "share"), [(-1.0, 0.5), (1.0, 1.0)])
+def test_cells_of_a_ball_half_in_glass_hold_what_has_the_larger_priority(priority: float, share: float) -> None:
+    """Glass of priority 0 takes the lower half of a ball, or none of it."""
+    _, _, edge, M = _moments(_cells(_ball(), {**MEDIUM, "priority": priority}, glass=_block()))
+    assert (M[:, 0, 0] * edge**3).sum() == pytest.approx(share * 4 / 3 * np.pi * 125, rel=1e-3)
+
+
+def test_cells_of_two_balls_that_overlap_hold_each_place_once() -> None:
+    """Balls of radius R, d apart, share pi (4 R + d) (2 R - d)² / 12."""
+    from full_geometry.precomputed.unscattered_light import inside_cells_of
+    from full_geometry.walk.media import WalkMedia
+
+    other = {**_ball(4.0, center=[5, 0, 0]), "bsdf": {"type": "translucent", **WHITE, "priority": 1.0}}
+    scene = _scene("precomputed", MEDIUM, _ball(4.0), light={"type": "constant"}, other=other)
+    cells = inside_cells_of(WalkMedia.of(scene, 1.0))
+    volumes = [(M[:, 0, 0] * edge**3).sum() for _, _, edge, M in map(_moments, cells)]
+    ball, shared = 4 / 3 * np.pi * 64, np.pi * (16 + 5) * (8 - 5) ** 2 / 12
+    assert sorted(volumes) == pytest.approx([ball - shared, ball], rel=1e-3)
 
 
 def test_cells_know_the_second_moments_of_a_ball() -> None:
@@ -195,7 +221,7 @@ def _mesh(name: str, folder: Path) -> dict:
     return {"type": "ply", "filename": str(path), "face_normals": True, "to_world": to_world}
 
 
-def _furnace(shape: dict, known_to: float, **more: Any) -> None:
+def _furnace(shape: dict, known_to: float, surface: dict = WHITE, **more: Any) -> None:
     """What absorbs nothing is as bright as the even sky around it, by z-tests beside a bias of .3 %."""
     film = {"type": "hdrfilm", "width": 12, "height": 12, "rfilter": {"type": "box"}, "pixel_format": "rgba",
             "component_format": "float32"}  # fmt: skip
@@ -203,7 +229,7 @@ def _furnace(shape: dict, known_to: float, **more: Any) -> None:
     sensor = {"type": "perspective", "fov": 18.0, "to_world": view, "film": film}
     integrator = {"type": "translucent_walk", "light": "precomputed", "hide_emitters": True}
     scene = _scene(
-        "precomputed", WHITE, shape, integrator=integrator, sensor=sensor, light={"type": "constant"}, **more
+        "precomputed", surface, shape, integrator=integrator, sensor=sensor, light={"type": "constant"}, **more
     )
     found = np.array([np.array(mi.render(scene, spp=4096, seed=k)).sum(axis=(0, 1)) for k in range(8)])
     ratio = found[:, :3] / found[:, 3:]
@@ -223,6 +249,11 @@ def test_a_hollow_or_branching_object_without_absorption_is_invisible_in_uniform
 @pytest.mark.slow
 def test_a_bubble_and_a_second_medium_without_absorption_are_invisible_in_uniform_light() -> None:
     _furnace(_ball(), 0.008, bubble=_held("bubble", 1.8, 1.5), medium=_held("medium", -1.8, 1.5))
+
+
+@pytest.mark.slow
+def test_a_ball_half_in_glass_without_absorption_is_invisible_in_uniform_light() -> None:
+    _furnace(_ball(), 0.004, {**WHITE, "priority": -1.0}, glass=_block())
 
 
 def _pair() -> tuple[dict, dict]:
@@ -260,6 +291,19 @@ def test_precomputed_light_around_what_lies_inside_has_the_mean_of_sampled_light
     held = {"medium": _held("medium", -1.8, 1.5), "bubble": _held("bubble", 1.8, 1.5)}
     stone = {**_ball(1.2, center=[0, -2.5, 3]), "bsdf": {"type": "diffuse", "reflectance": 0.7}}
     _compare(MEDIUM, 0.02, spp=2048, stone=stone, lamp=_lamp(), **held)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["in glass", "two media", "forward"])
+def test_precomputed_light_where_things_overlap_has_the_mean_of_sampled_light(case: str) -> None:
+    """Light comes by way of glass and of the other object, too."""
+    lights = {"lamp": _lamp(), "sky": {"type": "constant", "radiance": 0.3}}
+    if case == "two media":
+        other = {**_ball(4.0, center=[2.5, 0, 0]), "bsdf": {"type": "translucent", **WHITE, "priority": 1.0}}
+        _compare(MEDIUM, 0.02, _ball(4.0, center=[-2, 0, 0]), 512, other=other, **lights)
+        return
+    surface = {**MEDIUM, "g": 0.6 if case == "forward" else 0.0, "priority": -1.0}
+    _compare(surface, 0.02, _ball(), 512, glass=_block(), **lights)
 
 
 @pytest.mark.slow
@@ -425,18 +469,16 @@ def test_the_layer_of_emission_holds_the_mirror_and_what_is_behind_the_object() 
 
 
 @pytest.mark.parametrize(
-    ("surface", "other", "reason"),
+    ("surface", "reason"),
     [
-        ({**MEDIUM, "orders": "single"}, None, "orders of object 'object' are 'single'"),
-        ({**PAINTED, "g": 0.8}, None, r"abs\(g\) of object 'object' is above 0.5 in a scene with textures of media"),
-        ({**MEDIUM, "sigma_s": 1e4}, None, "so many mean free paths wide"),
-        (MEDIUM, {"type": "sphere", "center": [7, 0, 0], "radius": 4.0}, "objects overlap"),
+        ({**MEDIUM, "orders": "single"}, "orders of object 'object' are 'single'"),
+        ({**PAINTED, "g": 0.8}, r"abs\(g\) of object 'object' is above 0.5 in a scene with textures of media"),
+        ({**MEDIUM, "sigma_s": 1e4}, "so many mean free paths wide"),
     ],
 )
-def test_light_that_cannot_be_precomputed_is_refused_by_its_reason(surface: dict, other: Any, reason: str) -> None:
-    more = {"other": {**other, "bsdf": {"type": "translucent", **MEDIUM}}} if other else {}
+def test_light_that_cannot_be_precomputed_is_refused_by_its_reason(surface: dict, reason: str) -> None:
     with pytest.raises(ValueError, match=f"light must be auto or sampled, got 'precomputed': .*{reason}"):
-        mi.render(_scene("precomputed", surface, lamp=_lamp(), **more), spp=1)
+        mi.render(_scene("precomputed", surface, lamp=_lamp()), spp=1)
 
 
 @pytest.mark.parametrize("light", ["auto", "precomputed", "sampled"])
