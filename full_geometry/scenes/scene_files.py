@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from mitsuba.parser import ParserConfig, ParserState
 
 _HERE = str(Path(__file__).parents[2])
+EXPORTABLE = (".usd", ".usda", ".usdc", ".usdz", ".blend", ".fbx", ".obj")  # files of programs that write glTF too
 
 _PLACE = re.compile(r"(?:At|While loading) (?:dictionary node )?(.+? \(line \d+, col \d+\)|\S+): ")
 _SOURCE = re.compile(r"^\[[\w.]+:\d+\] ")
@@ -277,6 +278,8 @@ def parsed(scene: dict[str, Any] | str | Path, parameters: Mapping[str, str]) ->
             scene, (str(path) for s in (".xml", *SUFFIXES) for path in Path(scene).parent.glob(f"*{s}"))
         )
         raise ValueError(f"scene must be an XML or glTF file, got {str(scene)!r}, which does not exist{near}")
+    if not isinstance(scene, dict) and Path(scene).suffix.lower() in EXPORTABLE:
+        raise ValueError(f"scene must be an XML or glTF file, got {str(scene)!r}: export it as glTF 2.0 (.glb)")
     if is_gltf(scene) and parameters:
         raise ValueError(f"parameters must be left out of a glTF file, got {', '.join(parameters)}")
     try:

@@ -280,3 +280,11 @@ REFUSED = [
 def test_files_that_are_no_scene_are_refused(changes: dict, message: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=message):
         open_scene(_glb(tmp_path, **changes))
+
+
+@pytest.mark.parametrize("suffix", ["usda", "blend"])
+def test_a_file_of_another_format_is_refused_with_what_to_export(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"scene.{suffix}"
+    path.write_text("#usda 1.0")
+    with pytest.raises(ValueError, match=rf"scene must be an XML or glTF file, got .*{suffix}': export it as glTF 2.0"):
+        open_scene(path)
