@@ -256,20 +256,14 @@ class ViewMisfit(NamedTuple):
     exposure_curvature: float
 
 
-@dataclass(frozen=True, eq=False)
 class ViewComparison:
     """The views of a scene as it is now, against their images.
     `scene`, `views`, `settings`: as of `fit`, checked. `factors`: of each view, changed in place: of its render to its
     image, up to one common factor. `shown`: of views that were met, changed in place: B, without exposure."""
 
-    scene: mi.Scene
-    views: list[GivenView]
-    settings: FitSettings
-    factors: np.ndarray = field(init=False)
-    shown: dict[int, np.ndarray] = field(init=False, default_factory=dict)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "factors", np.ones(len(self.views)))
+    def __init__(self, scene: mi.Scene, views: list[GivenView], settings: FitSettings) -> None:
+        self.scene, self.views, self.settings = scene, views, settings
+        self.factors, self.shown = np.ones(len(views)), {}
 
     @property
     def fitted(self) -> list[int]:

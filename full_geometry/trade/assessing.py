@@ -122,7 +122,7 @@ def assess_stage(
     """As `assess`, of a scene that is made ready, with the time shared by all techniques alike.
     Denoised walks have `denoising` seconds each, or end where the error² of the samples that keep the tolerance has the
     relative error `known`."""
-    samples = SceneSamples.of(on, chosen, effort, progress)
+    samples = SceneSamples(on, chosen, effort, progress)
     samples.run([t for t in chosen if not t.denoised], seeded(effort.seed, 42), effort.seconds, effort.samples)
     seconds = DENOISED_SHARE * effort.seconds if denoising is None else denoising
     _denoise(samples, chosen, seconds, tolerance, True, known)
@@ -140,7 +140,7 @@ def assess_for(
     later = [t for t in chosen if not every and (t.gathers or t.model in dear)]
     ahead = [t for t in chosen if t not in later and not t.denoised]
     exits = effort.exits if every else min(effort.exits, MOST)
-    samples = SceneSamples.of(on, ahead, replace(effort, exits=exits), progress)
+    samples = SceneSamples(on, ahead, replace(effort, exits=exits), progress)
 
     def run(chosen: Sequence[Technique], number: int, seconds: float = 0.0) -> None:
         samples.run(chosen, seeded(effort.seed, number), seconds)

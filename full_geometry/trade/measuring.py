@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
@@ -50,12 +50,8 @@ FEWEST, POINTS = 64, 5e-3  # of points, and how many times V t
 # Of precomputed light before any measurement: means of images are right to .3 %, points to about .7 %. On a ball of
 # skin under lamp and sky, 1e7 samples gave 4.8e-5 +- 5.4e-5, on a blob under a sky 0.5e-5 +- 2e-5.
 KNOWN_BIAS2 = 5e-5
-KNOWN_LIGHT = (
-    0.03  # variance of precomputed light as that of a sample, before any measurement: 0.0003 to 0.016 of scenes
-)
-TELLING = (
-    0.02  # squared noise of walks at a point, above which their rare bright samples decide what they tell of a bias
-)
+KNOWN_LIGHT = 0.03  # variance of precomputed light as that of a sample, before measuring: 0.0003 to 0.016 of scenes
+TELLING = 0.02  # squared noise of walks at a point, above which their rare bright samples decide what they tell
 RUN, SLOW = 16_000, 4  # samples of all points in the first run of a technique, for slow walks a quarter
 UNEVEN = 1.5  # times the noise of a bias² if all points were as noisy
 STEADY = 0.05  # relative error of their variance where nothing may win against walks
@@ -63,11 +59,10 @@ GATHERED_SHARE = 0.2  # most of the time for samples of gathered light: sqrt(V t
 Samples = dict[Technique, "list[Sampled] | str"]  # of an object by each technique, or why it refuses the object
 
 
-@dataclass(eq=False)
 class SceneSamples:
     """The samples that have been taken of the objects of a scene.
 
-    Args:
+    Attributes:
         started: when, by `clock`.
         points: of each object; None where it is hardly seen.
         sampled: of each object by each technique.
@@ -75,28 +70,19 @@ class SceneSamples:
         denoised: of each object by denoised walks.
     """
 
-    on: Stage
-    effort: Effort
-    progress: NamedProgress | None
-    started: float
-    points: list[Exits | None]
-    sampled: list[Samples]
-    heard: list[list[str]]
-    mfp: list[tuple[float, float]]
-    denoised: dict[Technique, list[TechniqueTrade | None]] = field(default_factory=dict)
-    _training: dict[tuple[int, str], float] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, on: Stage, chosen: Sequence[Technique], effort: Effort, progress: NamedProgress | None) -> SceneSamples:
+    def __init__(self, on: Stage, chosen: Sequence[Technique], effort: Effort, progress: NamedProgress | None) -> None:
         """No samples yet, at exits of all objects, with kernels ready for what techniques have in common."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # they are heard when the techniques are made ready again
             for kind in ((True, "sampled"), (True, PRECOMPUTED), (False, "sampled")):
                 warm_up(on, [each for each in chosen if (each.walks, each.light) == kind])
-        started = clock()
-        seen = visible_exits(on.scene, on.shapes, effort.sensor, effort.exits, seeded(effort.seed, 41))
-        mfp = [_mfp(on, k) for k in range(len(seen))]
-        return cls(on, effort, progress, started, seen, [{} for _ in seen], [[] for _ in seen], mfp)
+        self.on, self.effort, self.progress, self.started = on, effort, progress, clock()
+        self.points = visible_exits(on.scene, on.shapes, effort.sensor, effort.exits, seeded(effort.seed, 41))
+        self.sampled: list[Samples] = [{} for _ in self.points]
+        self.heard: list[list[str]] = [[] for _ in self.points]
+        self.mfp = [_mfp(on, k) for k in range(len(self.points))]
+        self.denoised: dict[Technique, list[TechniqueTrade | None]] = {}
+        self._training: dict[tuple[int, str], float] = {}
 
     def run(self, chosen: Sequence[Technique], seed: int, seconds: float = 0.0, samples: int | None = None) -> None:
         """Sample all objects by some techniques, or go on with them.
