@@ -97,7 +97,7 @@ def fit(
     if textured:
         descent = TextureDescent(comparison, shape, variables_of(parameters, shape, mm_per_unit, scene))
     else:
-        descent = MediumDescent(comparison, FitParameters.of(parameters, shape, mm_per_unit))
+        descent = MediumDescent(comparison, FitParameters(parameters, shape, mm_per_unit))
     descend(descent, work, progress)
     return descent.result()
 

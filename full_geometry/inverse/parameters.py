@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -107,26 +106,19 @@ def size_bounds(shape: mi.Shape, mm_per_unit: float) -> tuple[float, float]:
     return SIZES[0] / extent, SIZES[1] / extent
 
 
-@dataclass(frozen=True, eq=False)
 class FitParameters:
-    """The parameters of one object that are fitted.
-    `names`: of `NAMES`. `sizes`: bounds of sigma_t, 1/mm."""
+    """The parameters of one object that are fitted, by name.
 
-    names: tuple[str, ...]
-    shape: mi.Shape
-    sizes: tuple[float, float]
+    Raises:
+        ValueError: a name is unknown or there twice, sigma_t and mfp are both asked for, or the medium varies.
+    """
 
-    @classmethod
-    def of(cls, names: Sequence[str], shape: mi.Shape, mm_per_unit: float) -> FitParameters:
-        """Choose the parameters of an object by name.
-
-        Raises:
-            ValueError: a name is unknown or there twice, sigma_t and mfp are both asked for, or the medium varies.
-        """
+    def __init__(self, names: Sequence[str], shape: mi.Shape, mm_per_unit: float) -> None:
         check_names(names, NAMES)
         if not surface_of(shape).spec.is_homogeneous:
             raise ValueError(f"the medium of {name_of(shape)} must be homogeneous to be fitted, got one that varies")
-        return cls(tuple(names), shape, size_bounds(shape, mm_per_unit))
+        self.names, self.shape = tuple(names), shape
+        self.sizes = size_bounds(shape, mm_per_unit)  # bounds of sigma_t, 1/mm
 
     def start(self) -> dict[str, mi.Float | mi.Spectrum]:
         """The variables of the medium as it is, within the bounds."""
