@@ -476,17 +476,17 @@ def kept_at(change: np.ndarray | float) -> np.ndarray | float:
 
 
 def arrays_of_means(means: Mapping[int, Any]) -> dict[str, np.ndarray]:
-    """Means of views, dataclasses of arrays and numbers, as a state keeps them."""
+    """Means of views, of arrays and numbers, as a state keeps them."""
     return {
         f"view {which} {key}": np.asarray(value) for which, each in means.items() for key, value in vars(each).items()
     }
 
 
-def means_of_arrays(arrays: Mapping[str, np.ndarray], kind: Callable[..., Any]) -> dict[int, Any]:
-    """The means of a class that a state keeps."""
-    kept: dict[int, dict[str, Any]] = {}
+def means_of_arrays(arrays: Mapping[str, np.ndarray], kind: Callable[[int, int], Any]) -> dict[int, Any]:
+    """The means that a state keeps, of a class that begins with numbers of pixels and of variables."""
+    kept: dict[int, Any] = {}
     for key, value in arrays.items():
         if key.startswith("view "):
             _, which, name = key.split()
-            kept.setdefault(int(which), {})[name] = value if value.ndim else float(value)
-    return {which: kind(**each) for which, each in kept.items()}
+            setattr(kept.setdefault(int(which), kind(0, 0)), name, value if value.ndim else float(value))
+    return kept

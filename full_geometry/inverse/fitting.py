@@ -17,7 +17,6 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -138,11 +137,10 @@ def _load(path: Path, of: str, descent: MediumDescent | TextureDescent) -> None:
     descent.restore(arrays)
 
 
-@dataclass(eq=False)
 class ViewMeans:
-    """Means of what was measured of a view in the steps.
+    """Means of what was measured of a view in the steps, nothing at first.
 
-    Args:
+    Attributes:
         weights, stiffness, image, variance: of all pixels; renders without exposure times weights, and variance of that
             mean by noise.
         x: the variables there.
@@ -152,25 +150,10 @@ class ViewMeans:
         own_share: sum of products of the weights of both.
     """
 
-    weights: np.ndarray
-    stiffness: np.ndarray
-    image: np.ndarray
-    variance: np.ndarray
-    x: np.ndarray
-    renders: float
-    J: np.ndarray
-    own: np.ndarray
-    jacobians: float = 0.0
-    own_share: float = 0.0
-
-    @classmethod
-    def none(cls, pixels: int, variables: int) -> ViewMeans:
-        """Before the first step."""
-        image, x, J = np.zeros(pixels), np.zeros(variables), np.zeros((pixels, variables))
-        return cls(
-            weights=image, stiffness=image, image=image, variance=image, x=x, renders=0.0, J=J,
-            own=np.zeros((2, variables)),
-        )  # fmt: skip
+    def __init__(self, pixels: int, variables: int) -> None:
+        self.weights = self.stiffness = self.image = self.variance = np.zeros(pixels)
+        self.x, self.J, self.own = np.zeros(variables), np.zeros((pixels, variables)), np.zeros((2, variables))
+        self.renders = self.jacobians = self.own_share = 0.0
 
     def forget(self, x: np.ndarray) -> None:
         """Count less for what is far from x."""
@@ -256,7 +239,7 @@ class MediumDescent:
     def _measure(self, which: int, k: int, x: np.ndarray) -> ViewMisfit:
         """Render a view twice, and add that to its means."""
         compared, view = self.comparison, self.comparison.views[which]
-        means = self.means.setdefault(which, ViewMeans.none(view.image.size, len(x)))
+        means = self.means.setdefault(which, ViewMeans(view.image.size, len(x)))
         if k < SETTLING * self.total:
             means.forget(x)
         one, both = compared.sloping(means.jacobians, self.x)

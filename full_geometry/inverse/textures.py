@@ -323,29 +323,15 @@ def _neighbours(shape: mi.Shape, attribute: str) -> np.ndarray:
     return np.stack([order[:-1][same], order[1:][same]], axis=1) // 3
 
 
-@dataclass(eq=False)
 class PixelMeans:
-    """Means of what was measured of a view in the steps, by pixel and channel.
+    """Means of what was measured of a view in the steps, by pixel and channel, nothing at first.
     `weights`, `stiffness`, `image`, `variance`: of renders without exposure times weights, and variance of that mean by
     noise. `slopes`: s of each variable, shape (variables, pixels). `shown`: D of the numbers of each variable there,
     likewise. `renders`, `sloped`: how many the means count for, and of them those of slopes."""
 
-    weights: np.ndarray
-    stiffness: np.ndarray
-    image: np.ndarray
-    variance: np.ndarray
-    slopes: np.ndarray
-    shown: np.ndarray
-    renders: np.ndarray
-    sloped: np.ndarray
-
-    @classmethod
-    def none(cls, pixels: int, variables: int) -> PixelMeans:
-        """Before the first step."""
-        one, many = np.zeros(pixels), np.zeros((variables, pixels))
-        return cls(
-            weights=one, stiffness=one, image=one, variance=one, slopes=many, shown=many, renders=one, sloped=one
-        )
+    def __init__(self, pixels: int, variables: int) -> None:
+        self.weights = self.stiffness = self.image = self.variance = self.renders = self.sloped = np.zeros(pixels)
+        self.slopes = self.shown = np.zeros((variables, pixels))
 
     def forget(self, shown: np.ndarray, by_x: np.ndarray) -> None:
         """Weigh earlier renders by how far their texels were, in variables: |D v - mean D v| / (D dv/dx)."""
@@ -440,7 +426,7 @@ class TextureDescent:
         """Render a view twice, and add that to its means."""
         compared, view = self.comparison, self.comparison.views[which]
         shown = self._at_pixels(which)
-        means = self.means.setdefault(which, PixelMeans.none(view.image.size, len(self.variables)))
+        means = self.means.setdefault(which, PixelMeans(view.image.size, len(self.variables)))
         # Forget what was measured at other texels: D v has moved by |D v - mean D v| / D v' in the variables.
         if k < SETTLING * self.total:
             means.forget(shown, self._at_pixels(which, by_x=True))
