@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import drjit as dr
@@ -99,7 +99,7 @@ def denoised_rows(
     number = int(np.clip(seconds / (WANTED * of_tile), *TILES))
     limits = np.max([found[k].limits for k in seen], axis=0)
     places = _places(on, halves[0], camera, film, limits, seed)
-    tiles = Tiles.of(on, camera, film, [places[seen[k % len(seen)]] for k in range(number)], seed)
+    tiles = Tiles(on, camera, film, [places[seen[k % len(seen)]] for k in range(number)], seed)
 
     # ---- samples of both halves, until errors are known or the time is over
     expected = each = 2 * PASSES * sum(float(tiles.seen[k]) * found[k].pace for k in seen)  # seconds of a sample of all
@@ -145,7 +145,6 @@ def denoised_rows(
 # and count the less.
 
 
-@dataclass(eq=False)
 class Tiles:
     """Windows of the film.
 
@@ -158,17 +157,9 @@ class Tiles:
         parts: samples of a pixel, and both halves of so many samples denoised.
     """
 
-    pixels: np.ndarray
-    guides: np.ndarray
-    weights: np.ndarray
-    seen: np.ndarray
-    halves: list[np.ndarray] = field(default_factory=lambda: [np.zeros(())] * 2)
-    parts: list[tuple[int, list[np.ndarray]]] = field(default_factory=list)
-
-    @classmethod
-    def of(
-        cls, on: Stage, camera: mi.Sensor, film: tuple[int, int], densities: Sequence[np.ndarray], seed: int
-    ) -> Tiles:
+    def __init__(
+        self, on: Stage, camera: mi.Sensor, film: tuple[int, int], densities: Sequence[np.ndarray], seed: int
+    ) -> None:
         """Windows about places drawn from densities over the film, (H, W), one for each; without samples yet."""
         # ---- places, by numbers that are even over all densities
         rng, size = np.random.default_rng(seed), np.minimum(film, SIDE)
@@ -179,15 +170,17 @@ class Tiles:
             corners.append(np.clip(np.array([x, y]) - size // 2, 0, np.array(film) - size))
 
         # ---- guides, covers and weights
-        pixels = np.concatenate([pixels_of(size, corner) for corner in corners])
+        self.pixels = pixels = np.concatenate([pixels_of(size, corner) for corner in corners])
         shape = (len(corners), int(size[1]), int(size[0]))
         found = pixel_means(camera, film, pixels, GUIDE_SPP, seeded(seed, 61), _aovs_of(on.scene)).reshape(*shape, -1)
         near = sum(uniform_filter(p, SIDE - 2 * MARGIN, mode="constant") for p in densities)
         drawn = near[pixels[:, 1], pixels[:, 0]].reshape(*shape, 1)
-        weights = (found[..., 6:] > 0) / np.maximum(drawn, LEAST_DENSITY * drawn.max())
-        for tile, corner in zip(weights, corners):
+        self.guides, covered = found[..., :6], found[..., 6:] > 0
+        self.weights, self.seen = covered / np.maximum(drawn, LEAST_DENSITY * drawn.max()), covered.sum(axis=(0, 1, 2))
+        for tile, corner in zip(self.weights, corners):
             tile *= _inner(size, corner, film)[..., None]
-        return cls(pixels, found[..., :6], weights, (found[..., 6:] > 0).sum(axis=(0, 1, 2)))
+        self.halves: list[np.ndarray] = [np.zeros(())] * 2
+        self.parts: list[tuple[int, list[np.ndarray]]] = []
 
     def take(self, half: int, passes: np.ndarray, before: int, spp: int) -> None:
         """Add `spp` samples to the passes of a half, (passes, pixels, 3), of `before` samples so far."""

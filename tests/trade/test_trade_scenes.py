@@ -385,7 +385,7 @@ def test_tiles_that_are_drawn_where_samples_differ_have_the_mean_of_the_object()
     near["sensor"]["fov"] = 16
     on, film = stage(near), (64, 64)
     camera, p = on.scene.sensors()[0], np.tile(np.linspace(1.0, 9.0, 64), (64, 1))  # nine times as often at the right
-    tiles = Tiles.of(on, camera, film, [p / p.sum()] * 36, 0)
+    tiles = Tiles(on, camera, film, [p / p.sum()] * 36, 0)
     normals = guides(on.scene)[1][..., 0]  # of a ball: 0 in the mean
     x = tiles.guides[..., 3]
     w = tiles.weights[..., 0]
