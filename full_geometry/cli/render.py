@@ -172,7 +172,9 @@ def _image(
         denoise = Denoiser(way.scene, which["sensor"]) if way.denoise else None
         result = _rendered(way.scene, file, way.limits, {**which, "denoise": denoise}, images.resume)
         clean = cross_denoised(result, denoise) if denoise else None
-        told, error = _numbers(result), _error(result, way.limits.target_error or SMALL_ERROR)
+        relative, error = result.relative_error, _error(result, way.limits.target_error or SMALL_ERROR)
+        told = {"samples": str(result.spp), "time, s": f"{result.seconds:.3g}"}
+        told["relative error"] = f"{relative:.2%}" if 0 < relative < math.inf else "–"
         off = (clean.image, {"error": clean.told}) if clean else None
         colours = result.mean[..., :3] if result.mean.shape[2] >= 3 else result.mean[..., :1].repeat(3, axis=2)
         picture = Picture(file.stem, colours, told, error, off)
@@ -380,12 +382,6 @@ def _publish(picture: Picture, file: Path, drawn: dict[str, bytes]) -> list[Path
     gone = [file.with_suffix(f".{ending}") for ending in (*ENDINGS, *PHASES) if ending not in endings]
     replace_together(moves, gone)
     return [path for path in moves.values() if path.suffix != ".json"]
-
-
-def _numbers(reference: Reference) -> dict[str, str]:
-    error = reference.relative_error
-    told = f"{error:.2%}" if 0 < error < math.inf else "–"
-    return {"samples": str(reference.spp), "time, s": f"{reference.seconds:.3g}", "relative error": told}
 
 
 SMALL_ERROR = 0.01  # below which nobody has to know where the noise of an image is from

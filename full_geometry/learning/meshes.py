@@ -340,10 +340,6 @@ def box(p: np.ndarray, half: np.ndarray, rounding: float = 0.0) -> np.ndarray:
     return length(*np.moveaxis(np.maximum(q, 0), -1, 0)) + np.minimum(q.max(axis=-1), 0) - rounding
 
 
-def _angles(rng: np.random.Generator) -> np.ndarray:
-    return rng.uniform(-np.pi, np.pi, 3)
-
-
 def blobs(rng: np.random.Generator) -> Made:
     """Ellipsoids and rods that are blended."""
     n, blend = int(rng.integers(1, 6)), rng.uniform(0.01, 0.3)
@@ -406,7 +402,7 @@ def sheets(rng: np.random.Generator) -> Made:
 def shells(rng: np.random.Generator) -> Made:
     """A bowl: an ellipsoid hollowed out and opened by a plane."""
     radii, thick = rng.uniform(0.4, 0.8, 3), np.exp(rng.uniform(np.log(0.035), np.log(0.2)))
-    level, tilt, blend = rng.uniform(-0.4, 0.5), _angles(rng), rng.uniform(0.0, 0.05)
+    level, tilt, blend = rng.uniform(-0.4, 0.5), rng.uniform(-np.pi, np.pi, 3), rng.uniform(0.0, 0.05)
 
     def distance(p: np.ndarray) -> np.ndarray:
         outer = ellipsoid(p, tuple(radii))
