@@ -39,7 +39,7 @@ REFERENCE = "reference"
 PASSING = (*VOLUMES, SAMPLED, PRECOMPUTED)  # whose passes are independent
 BLOCK = 8  # pixels of its side
 REFERENCE_SPP = 64  # of a pass of the reference
-MOST_SPP = 1024  # of a pass
+LEAST_SPP, MOST_SPP = 1, 1024  # of a pass
 SHARE = 4  # passes in the shortest time: their spread tells the variance
 
 
@@ -150,7 +150,7 @@ def _averaged(images: np.ndarray, spp: int) -> Reference:
 
 def _corrected(fresh: Callable[[], mi.Scene], limit: float, seed: int) -> Reference:
     """The image of most samples, a power of two, whose light and pixels take so many CPU seconds from a fresh scene."""
-    spp, best = 1, None
+    spp, best = LEAST_SPP, None
     mi.render(fresh(), spp=1, seed=seed)  # compiles
     while spp <= MOST_SPP:
         scene, started = fresh(), time.process_time()
