@@ -74,6 +74,7 @@ TEXTURE = """<texture name="albedo" type="bitmap"> <string name="filename" value
 RUN = """
 import contextlib
 import dataclasses
+import functools
 import io
 import json
 import os
@@ -82,10 +83,11 @@ import sys
 import time
 
 import quick_kernels
+import quick_light
 from figures import fig09
 from figures.command_line import main
 from figures.parts import command as figure_command
-from full_geometry.integrators import correction
+from full_geometry.learning import model_errors as errors_of_objects
 from full_geometry.learning import training
 from halfspace_sss.comparison import model_errors
 from halfspace_sss.maps.noisy_maps import CellGrid
@@ -97,7 +99,10 @@ fig09.SHOWN, fig09.MODELS, fig09.SIZES = {"draft": ("ketchup",)}, ("better_dipol
 figure_command.MOST_WORKERS = 1  # others would import and compile for themselves
 # walks of numbers that nobody reads
 training.EXITS, training.WALKS, training.SAMPLES = 16, 256, 64
-correction.PER_LAUNCH, correction.FEWEST = 2**14, 2**15
+few = dataclasses.replace(training.STANDARD, chunk=2**12)
+training.TrainingPlan = functools.partial(training.TrainingPlan, recipe=few)
+errors_of_objects.errors_of.__kwdefaults__.update(walks=256, samples=64)
+quick_light.gather_by_few(setattr)
 model_errors.GRID = CellGrid(16, 8)
 train_material = sys.modules["halfspace_sss.neural.training.train_material"]  # a function of the package has its name
 train_material.FAST = train_material.STANDARD = dataclasses.replace(FAST, n_groups=16, events=1e5, grid=CellGrid(8, 4))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pandas
 import pytest
+from quick_light import gather_by_few
 
 pytest.importorskip("mitsuba")
 pytest.importorskip("torch")
@@ -58,6 +59,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fig06, "MATERIAL", "ketchup")
     for name, value in (("EXITS", 16), ("WALKS", 128), ("SAMPLES", 64)):
         monkeypatch.setattr(training, name, value)
+    gather_by_few(monkeypatch.setattr)
     monkeypatch.setitem(fig07.RIVALS_SPP, "draft", dict.fromkeys(fig07.RIVALS_SPP["draft"], 16))
     monkeypatch.setitem(fig07.SECONDS, "draft", 0.01)
     monkeypatch.setattr(distant_light, "DIRECTIONS", 12)
