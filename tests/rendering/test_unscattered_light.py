@@ -275,7 +275,7 @@ def test_precomputed_light_of_two_balls_that_touch_has_the_mean_of_sampled_light
 
 
 def test_precomputed_light_of_a_lamp_has_the_mean_of_sampled_light() -> None:
-    _compare(MEDIUM, 0.015, spp=1024, lamp=_lamp())
+    _compare(MEDIUM, 0.015, spp=512, lamp=_lamp())
 
 
 @pytest.mark.slow
@@ -329,7 +329,7 @@ def test_precomputed_light_has_the_mean_of_sampled_light(case: str) -> None:
     elif case == "sun":
         _compare(MEDIUM, 0.02, light={"type": "directional", "direction": [-1, -2, -0.5], "irradiance": 3.0})
     elif case == "floor":
-        _compare(MEDIUM, 0.02, floor=floor, **lamp)
+        _compare(MEDIUM, 0.02, spp=256, floor=floor, **lamp)
     elif case == "two":
         other = {**_ball(3.0, center=[8, -1, 5]), "bsdf": {"type": "translucent", **MEDIUM, "sigma_s": "2.0,1.0,0.7"}}
         _compare(MEDIUM, 0.02, other=other, **lamp)
@@ -369,7 +369,7 @@ FORWARD = {"sigma_s": "10.0,15.0,20.0", "sigma_a": "0.01,0.05,0.3", "eta": 1.4}
 )
 def test_precomputed_light_of_an_even_sky_has_the_mean_of_sampled_light_at_any_g(g: str) -> None:
     surface = {**(MEDIUM if g == "-0.6" else FORWARD), "g": g}
-    _compare(surface, 0.003, _ball(3.0), light={"type": "constant"})
+    _compare(surface, 0.003, _ball(3.0), spp=512, light={"type": "constant"})
 
 
 @pytest.mark.slow
