@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,19 +11,46 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter
 
 from halfspace_sss.comparison.style import TEXT, TRACED, look, paper, saved
+from halfspace_sss.physics.medium import Medium
 
 RATIO_SPAN = 12.0  # the ratio panels show 1/12 to 12 at most; what is beyond lies at the edge of the panel
 MOST_COLUMNS = 4
-CurveSet = Curve = Any  # those of `curve_set`, which imports this module to draw itself
 
 
-def render(curves: CurveSet) -> dict[str, bytes]:
+class PlottedCurve(Protocol):
+    """What is drawn of a `curve_set.Curve`."""
+
+    series: str
+    orders: str
+    S: np.ndarray
+    standard_error: np.ndarray
+
+
+class PlottedCurves(Protocol):
+    """What is drawn of a `curve_set.CurveSet`, which draws itself by this module."""
+
+    title: str
+    medium: Medium
+    theta_o_deg: float
+    delta_phi_deg: float
+    line_deg: float
+    r: np.ndarray
+    r_edges: np.ndarray
+    theta_i_deg: tuple[float, ...]
+    series: tuple[str, ...]
+    curves: Sequence[PlottedCurve]
+
+    def curve(self, series: str, theta_i_deg: float) -> PlottedCurve:
+        """The curve of one series and direction."""
+
+
+def render(curves: PlottedCurves) -> dict[str, bytes]:
     """The figure as {"pdf": bytes, "png": bytes}."""
     with paper():
         return saved(draw(curves))
 
 
-def draw(curves: CurveSet) -> Figure:
+def draw(curves: PlottedCurves) -> Figure:
     """One column for each direction of incidence: above S(r) with 2 standard errors, below S over path-traced S.
     Without a path-traced curve there is nothing below."""
     angles, rows = curves.theta_i_deg, 2 if TRACED in curves.series else 1
@@ -40,7 +67,7 @@ def draw(curves: CurveSet) -> Figure:
         above, below = grid[rows * block, column], grid[rows * (block + 1) - 1, column]
         _draw_radiance(above, curves, theta)
         above.set_ylim(*limits)
-        above.set_title(rf"({chr(97 + k)})  $\theta_i$ = {theta:g}°", pad=3)
+        above.set_title(_title(theta, k), pad=3)
         if column == 0:
             above.set_ylabel(r"$S$ [mm$^{-2}$ sr$^{-1}$]")
         if rows == 2:
@@ -55,11 +82,15 @@ def draw(curves: CurveSet) -> Figure:
     return figure
 
 
-def _models(curves: CurveSet) -> list[str]:
+def _models(curves: PlottedCurves) -> list[str]:
     return [series for series in curves.series if series != TRACED]
 
 
-def _caption(curves: CurveSet) -> str:
+def _title(theta: float, k: int) -> str:
+    return rf"({chr(97 + k)})  $\theta_i$ = {theta:g}°"
+
+
+def _caption(curves: PlottedCurves) -> str:
     m = curves.medium
     name = f"{curves.title}: " if curves.title else ""
     line = {90.0: "perpendicular to the plane of incidence", 0.0: "in the forward direction"}
@@ -75,7 +106,7 @@ def _positive(values: np.ndarray) -> np.ndarray:
     return np.where(values > 0, values, np.nan)
 
 
-def _limits(curves: CurveSet) -> tuple[float, float]:
+def _limits(curves: PlottedCurves) -> tuple[float, float]:
     """About the path-traced curves and, up to a factor of 30 above and 10 below, the models."""
     known = [c for c in curves.curves if c.series == TRACED] or curves.curves
     traced = np.concatenate([c.S[c.S > 3 * c.standard_error] for c in known])
@@ -87,7 +118,7 @@ def _limits(curves: CurveSet) -> tuple[float, float]:
     return 0.6 * bottom, 1.7 * top
 
 
-def _draw_radiance(ax: Axes, curves: CurveSet, theta: float) -> None:
+def _draw_radiance(ax: Axes, curves: PlottedCurves, theta: float) -> None:
     ax.set(xscale="log", yscale="log", xlim=(curves.r_edges[0], curves.r_edges[-1]))
     for series in _models(curves):
         style = look(series)
@@ -100,7 +131,7 @@ def _draw_radiance(ax: Axes, curves: CurveSet, theta: float) -> None:
     _ticks(ax)
 
 
-def _draw_ratio(ax: Axes, curves: CurveSet, theta: float) -> None:
+def _draw_ratio(ax: Axes, curves: PlottedCurves, theta: float) -> None:
     traced = curves.curve(TRACED, theta)
     S = _positive(np.where(traced.S > 3 * traced.standard_error, traced.S, np.nan))
     noise = 2 * traced.standard_error / S
@@ -125,13 +156,13 @@ def _ticks(ax: Axes) -> None:
     ax.tick_params(which="both", top=True, right=True)
 
 
-def _legend(figure: Figure, curves: CurveSet, columns: int) -> None:
+def _legend(figure: Figure, curves: PlottedCurves, columns: int) -> None:
     from matplotlib.lines import Line2D
 
     first = curves.curves[0]
     dots = {"color": "k", "lw": 0.7, "marker": "o", "ms": 2.2, "mew": 0}
     handles = [Line2D([], [], label=_label(first), **dots)] if first.series == TRACED else []
-    firsts: Sequence[Curve] = [curves.curve(s, curves.theta_i_deg[0]) for s in _models(curves)]
+    firsts: Sequence[PlottedCurve] = [curves.curve(s, curves.theta_i_deg[0]) for s in _models(curves)]
     for c in firsts:
         style = look(c.series)
         handles.append(Line2D([], [], color=style.color, ls=style.dash, label=_label(c)))
@@ -144,7 +175,7 @@ def _legend(figure: Figure, curves: CurveSet, columns: int) -> None:
     )  # fmt: skip
 
 
-def _label(c: Curve) -> str:
+def _label(c: PlottedCurve) -> str:
     """A star marks models that contain single scattering."""
     if c.series == TRACED:
         return r"Path traced ($\pm 2\,\sigma$)"
