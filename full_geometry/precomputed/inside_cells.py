@@ -415,7 +415,7 @@ def _bounds(media: WalkMedia, k: mi.Int32, si: mi.SurfaceInteraction3f) -> mi.Bo
     if not media.overlaps:
         return held
     of, number = media.inner.priorities, media.inner.priorities.instance_table.number(si, si.is_valid())
-    return held | (of.bit_of(number, mi.Bool(True)) != 0) & (number != k)
+    return held | (of.bit_of(number) != 0) & (number != k)
 
 
 def _ahead(media: WalkMedia, k: mi.Int32, ray: mi.Ray3f) -> tuple[mi.Float, mi.Bool, mi.Bool]:
@@ -462,7 +462,7 @@ def _ahead(media: WalkMedia, k: mi.Int32, ray: mi.Ray3f) -> tuple[mi.Float, mi.B
     _, first, inside, met, around, _, _ = dr.while_loop(state, lambda *s: s[-1], nearer, label="surfaces ahead")
     inside &= met & 1 != 0
     if media.overlaps:
-        own = media.inner.priorities.bit_of(k, mi.Bool(True))
+        own = media.inner.priorities.bit_of(k)
         inside &= (own == 0) | (around >> 1 < own)  # its bit is the highest
     return first, dr.isfinite(first), inside
 

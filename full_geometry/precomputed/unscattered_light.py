@@ -438,9 +438,8 @@ class _Rays:
             flux=flux / dr.maximum(survive, 1e-20), density=density, alive=alive,
         )  # fmt: skip
         a, b = vars(at_event), vars(at_surface)
-        state = {key: dr.select(scatters, a[key], b[key]) for key in a if key not in ("rng", "within")}
-        within = dr.select(scatters, ray.within, at_surface.within) if len(ray.within) else ()
-        return _Ray(**state, rng=rng, within=within)
+        state = {key: dr.select(scatters, a[key], b[key]) for key in a if key != "rng"}
+        return _Ray(**state, rng=rng)
 
     def _collide(self, ray: _Ray, t: mi.Float, far: mi.Float, alive: mi.Bool) -> tuple:
         """The distance of the first collision that is not null, where a medium varies, the flux and density there or at

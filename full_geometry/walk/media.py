@@ -61,6 +61,7 @@ class InclusionTable:
             the number of an object, whether it stands `alone`, neither in another nor around anything, and whether it
             is `enclosed` by another and overlaps nothing.
         lights: the delta lights in the medium of an object, and its number.
+        glass: geometry of the shapes that refract in them, and of those that hold or overlap such glass.
         priorities: of what overlaps; None where nothing does.
     """
 
@@ -68,6 +69,7 @@ class InclusionTable:
     instance_table: InstanceTable
     tables: dict[str, mi.Int32 | mi.Bool]
     lights: list[tuple[mi.Emitter, int]]
+    glass: list[Geometry]
     priorities: Priorities | None = None
 
     @classmethod
@@ -121,7 +123,7 @@ class InclusionTable:
         tables["displaces"] = mi.Bool([displaces[kind] for kind in instance_table.kind])
         dr.make_opaque(tables)
         lights = [(light, k) for light, k in lights.values() if is_delta(light) and k >= 0]
-        return cls(instance_table.scene(scene), instance_table, tables, lights, priorities)
+        return cls(instance_table.scene(scene), instance_table, tables, lights, glass, priorities)
 
     @property
     def shines(self) -> bool:
@@ -459,11 +461,10 @@ class WalkMedia:
         """Numbers of the objects, then of the glass that overlaps them."""
         return self.inner.priorities.instance_table if self.overlaps else self.instance_table
 
-    @cached_property
+    @property
     def holder_shapes(self) -> list[Geometry]:
         """The shapes of these."""
-        glass = self.holders.shapes[len(self.objects) :]
-        return [*self.objects, *(analyse_shape(shape, self.scene) for shape in glass)]
+        return [*self.objects, *(self.inner.glass if self.overlaps else [])]
 
     @property
     def lit_from_outside(self) -> list[int]:
@@ -485,7 +486,11 @@ class WalkMedia:
         if self.inner is None:
             return None
         table, shapes = self.inner.instance_table, list(self.objects)
+        known = {id(each.shape): each for each in self.inner.glass}
         for shape in table.shapes[len(shapes) :]:
+            if id(shape) in known:
+                shapes.append(known[id(shape)])
+                continue
             try:
                 shape.surface_area()
             except RuntimeError:  # Mitsuba's, of curves

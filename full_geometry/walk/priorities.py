@@ -126,14 +126,14 @@ class Priorities:
         """The boundary of member k to what is outside of all."""
         return self.boundaries[int(self.tables["boundary"][k])]
 
-    def bit_of(self, number: mi.Int32, active: mi.Bool) -> mi.UInt32:
+    def bit_of(self, number: mi.Int32, active: mi.Bool | bool = True) -> mi.UInt32:
         """The bit of a thing by its number, which may be -1; 0 of what is no member."""
         return dr.gather(mi.UInt32, self.tables["bit"], dr.maximum(number, 0), active & (number >= 0))
 
     def meet(self, si: mi.SurfaceInteraction3f, d: mi.Vector3f, within: mi.UInt32) -> Meeting:
         """What a ray along d has met; the normal at `si` is on the outside of objects."""
         number = self.instance_table.number(si, si.is_valid())
-        near, bit = dr.maximum(number, 0), self.bit_of(number, mi.Bool(True))
+        near, bit = dr.maximum(number, 0), self.bit_of(number)
         member = bit != 0
 
         # ---- bits behind it: set on the way in, cleared on the way out; others on top of it hide it
