@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -24,11 +24,9 @@ from halfspace_sss.cli.errors import errors_materials, errors_truths, validate
 from halfspace_sss.cli.shared import Commands, add, group
 from halfspace_sss.cli.train import maps, train_material, train_universal
 from halfspace_sss.extensions import COMMANDS, FAILURES, commands, warn_left_out
+from halfspace_sss.lazy import LazyModule
 
-if TYPE_CHECKING:
-    from full_geometry.inverse.comparing import MaterialFit
-    from full_geometry.scenes.reference_store import Picture
-    from full_geometry.trade.images import TradePicture
+page, trade_plot = LazyModule("figures.drawing.page"), LazyModule("figures.drawing.trade_plot")
 
 GROUPS: Mapping[str, tuple[str, Mapping[str, Callable]]] = {
     "materials": (
@@ -72,25 +70,11 @@ def drawers() -> Drawers | None:
     """What draws results of commands; None where the libraries for it are not installed."""
     if any(find_spec(name) is None for name in ("PIL", "matplotlib")):
         return None
-    return Drawers(_draw_render, _draw_fit, _draw_trade)
-
-
-def _draw_render(picture: Picture) -> dict[str, bytes]:
-    from figures.drawing.page import render
-
-    return render(picture)
-
-
-def _draw_fit(found: MaterialFit) -> dict[str, bytes]:
-    from figures.drawing.page import fit
-
-    return {"html": fit(found)}
-
-
-def _draw_trade(picture: TradePicture) -> dict[str, bytes]:
-    from figures.drawing.trade_plot import render
-
-    return render(picture)
+    return Drawers(
+        lambda picture: page.render(picture),
+        lambda found: {"html": page.fit(found)},
+        lambda picture: trade_plot.render(picture),
+    )
 
 
 def make() -> typer.Typer:

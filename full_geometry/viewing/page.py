@@ -22,8 +22,7 @@ from full_geometry.settings import PATH_TRACED
 from full_geometry.trade.image_differences import srgb
 from full_geometry.transport.models import model_names
 from full_geometry.viewing.edits import Camera, Edits, Way
-from full_geometry.viewing.live import LiveScene
-from full_geometry.viewing.screen import Screen, Wish
+from full_geometry.viewing.live import LiveScene, Screen, Wish
 from halfspace_sss import materials
 from halfspace_sss.backend import BackendError, needed
 from halfspace_sss.checks import check_count

@@ -94,7 +94,7 @@ def test_pixels_below_0_are_told_and_fitted_and_results_are_there_if_the_page_fa
     def broken(*_: Any) -> bytes:
         raise ValueError("no page")
 
-    monkeypatch.setattr(cli, "_draw_fit", broken)
+    monkeypatch.setattr("figures.drawing.page.fit", broken)
     done = CliRunner().invoke(cli.app, [*arguments, "--out", str(tmp_path / "rest")])
     assert done.exit_code == 2 and "no page" in done.output
     assert {path.name for path in (tmp_path / "rest").iterdir()} == names - {"a_fit.html"}

@@ -21,9 +21,8 @@ from browser import chromium
 
 from full_geometry.surface.translucent import check_eta, is_rough
 from full_geometry.viewing.edits import Camera, Edits, Way
-from full_geometry.viewing.live import LiveScene, Shown
+from full_geometry.viewing.live import LiveScene, Screen, Shown, Wish
 from full_geometry.viewing.page import check_port, free_port, refusal
-from full_geometry.viewing.screen import Screen, Wish
 
 SCENE = """<scene version="3.0.0">
     <integrator type="bssrdf"> <string name="light" value="sampled"/> </integrator>
