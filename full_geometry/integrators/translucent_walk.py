@@ -115,7 +115,7 @@ def _class(variant: str) -> type:
 
         def take(self, scene: mi.Scene, outgoing: OutgoingLight, light: UnscatteredLight | None) -> None:
             """Light that leaves objects of a scene, by which walks end, and light inside; until something changes."""
-            self.outgoing, self._kept = outgoing, (light_state(scene), light and light.alone())
+            self.outgoing, self._kept = outgoing, (light_state(scene), light)
 
         def prepare(self, scene: mi.Scene, samples: int, seed: int = 0) -> None:
             """Precompute light once for all calls of `sample`, until objects or emitters change.

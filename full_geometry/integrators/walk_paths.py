@@ -716,9 +716,9 @@ class PathTracer:
         # ---- next-event estimation: L += throughput f cos L_e / p_e  p_e / (p_e + p_f)
         L = light.L + self.visitor.sampled_emitter(walk, si, bsdf, lit, outer)
 
-        # ---- deep light that is known: L += throughput a C.Y
+        # ---- deep light that is known, unless the last event has had it: L += throughput a C.Y
         if self.visitor.outgoing is not None:
-            held, deep = self.visitor.outgoing.radiance(si, near, -walk.d, _in_air(translucent, behind))
+            held, deep = self.visitor.outgoing.radiance(si, near, -walk.d, _in_air(translucent, behind) & ~light.ended)
             L = L + walk.weight * deep
 
         # ---- emitters in the mirror of a smooth boundary, and behind it: F L_e, (1 - F) T (1 - F') L_e

@@ -75,7 +75,6 @@ class UnscatteredLight:
             None where that is left to walks.
         tables: by the number of an object, where its bricks begin, their corner, 1/h and counts.
         forward: whether it has met forward events, see `forward_scattering`.
-        straight: the same as `fluence` without light by way of other surfaces, which comes with `scattered`.
     """
 
     index: CellIndex
@@ -84,13 +83,6 @@ class UnscatteredLight:
     tables: dict[str, Any]
     forward: bool
     scattered: mi.Float | None = None
-    straight: mi.Float | None = None
-
-    def alone(self) -> UnscatteredLight:
-        """The light L_0 of rays alone, for walks that meet all other light by chance."""
-        if self.scattered is None:
-            return self
-        return replace(self, fluence=self.straight, scattered=None, straight=None)
 
     def light(self, media: WalkMedia, event: Event, last: mi.Bool | bool = False) -> tuple[mi.Spectrum, mi.Bool]:
         """Light that an event of a walk scatters on along it, per weight of the walk, and whether a cell holds it.
@@ -191,7 +183,7 @@ def _with_paths(
         parts.append(part)
     scattered, others = _joined(parts[: len(cells)]), light.fluence + _joined(parts[len(cells) :])
     dr.make_opaque(scattered, others)
-    return replace(light, fluence=others, scattered=scattered, straight=light.fluence)
+    return replace(light, fluence=others, scattered=scattered)
 
 
 def _joined(parts: list) -> Any:

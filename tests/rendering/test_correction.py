@@ -307,3 +307,24 @@ def test_it_takes_what_walks_take_and_has_their_means_within_1_percent(things: A
         typical = np.sqrt(np.square(noise).mean())  # four images tell the noise of one quarter within 40 % alone
         assert typical < 0.03 and (off < 0.01 + 4 * np.maximum(noise, typical)).all(), (a / b, noise)
     assert len(scene.integrator().gathered) == (2 if things is _by_a_model else 4)
+
+
+@pytest.mark.slow
+def test_light_that_a_floor_mirrors_onto_a_wall_is_known_where_it_scatters_first() -> None:
+    """A tenth of the light of the dark channel; the medium is even in direction, so that all light is in the cells."""
+    wax = {"type": "translucent", "sigma_s": ".3,.6,.9", "sigma_a": ".7,.4,.1", "eta": 1.6, "model": "better_dipole"}
+    T = mi.ScalarTransform4f
+    to_lamp, to_camera = T().look_at([40, 8, 0], [-5, 1, 0], [0, 1, 0]), T().look_at([10, 6, 12], [-5, 2, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    scene = {
+        "type": "scene",
+        "sensor": {"type": "perspective", "fov": 25.0, "to_world": to_camera, "film": film},
+        "floor": {"type": "cube", "to_world": T().translate([0, -1, 0]).scale([5, 1, 5]), "bsdf": wax},
+        "wall": {"type": "cube", "to_world": T().translate([-6.5, 3, 0]).scale([1, 4, 5]), "bsdf": wax},
+        "lamp": {"type": "rectangle", "to_world": to_lamp.scale(2), "emitter": {"type": "area", "radiance": 300.0}},
+    }
+    walked, corrected = (
+        _image(mi.load_dict({**scene, "integrator": each}), spp).mean(axis=(0, 1))
+        for each, spp in (({"type": "translucent_walk"}, 1024), ({"type": "bssrdf", "light": "corrected"}, 64))
+    )
+    np.testing.assert_allclose(corrected, walked, rtol=0.025)
