@@ -52,11 +52,16 @@ def _means(scene: Any, runs: int, spp: int, seed: int) -> np.ndarray:
     return independent(scene, runs, spp, seed).mean(axis=(1, 2))
 
 
-def _compare(surface: dict, known_to: float, shape: dict | None = None, spp: int = 1024, **more: Any) -> None:
-    """Mean colours with precomputed and with sampled light agree, and are known to a share of themselves."""
+def _compare(
+    surface: dict, known_to: float, shape: dict | None = None, spp: int = 1024, fewer: int = 4, **more: Any
+) -> None:
+    """Mean colours with precomputed and with sampled light agree, and are known to a share of themselves.
+
+    Precomputed light of lamps has less noise, and takes `fewer` times fewer samples.
+    """
     found, wanted = (
-        _means(_scene(light, surface, shape, **more), runs, spp, seed)
-        for light, runs, seed in (("precomputed", 8, 1), ("sampled", 12, 101))
+        _means(_scene(light, surface, shape, **more), runs, n, seed)
+        for light, runs, n, seed in (("precomputed", 8, spp // fewer, 1), ("sampled", 12, spp, 101))
     )
     error = np.hypot(*(x.std(axis=0, ddof=1) / np.sqrt(len(x)) for x in (found, wanted)))
     assert (error < known_to * wanted.mean(axis=0)).all(), error / wanted.mean(axis=0)
@@ -205,73 +210,31 @@ def test_a_medium_without_absorption_is_invisible_in_uniform_light() -> None:
     assert (np.abs(means.mean(axis=0) - 1) < WIDEST_Z * error + 0.002).all()
 
 
-def _mesh(name: str, folder: Path) -> dict:
-    """A bowl, open towards the camera, or a hand, about 10 units wide, without interpolated normals."""
+@pytest.mark.slow
+def test_a_branching_object_without_absorption_is_invisible_in_uniform_light(tmp_path: Path) -> None:
+    """A hand about 10 units wide, without interpolated normals, by z-tests beside a bias of .3 %."""
     meshes = pytest.importorskip("full_geometry.learning.meshes")
     hands = pytest.importorskip("benchmarks.hand_and_ribbon")
     pytest.importorskip("igl")
-
-    def bowl(p: np.ndarray) -> np.ndarray:
-        whole = meshes.ellipsoid(p, (1.0, 1.0, 1.0))
-        return np.maximum(np.abs(whole + 0.15) - 0.15, p[..., 2] - 0.3)
-
-    distance, box = hands.hand() if name == "hand" else (bowl, meshes.margin([-1] * 3, [1] * 3))
-    path = meshes.surface(distance, box, 48).write_ply(folder / f"{name}.ply")
-    to_world = mi.ScalarTransform4f().scale(9.0 if name == "hand" else 5.0)
-    return {"type": "ply", "filename": str(path), "face_normals": True, "to_world": to_world}
-
-
-def _furnace(shape: dict, known_to: float, surface: dict = WHITE, **more: Any) -> None:
-    """What absorbs nothing is as bright as the even sky around it, by z-tests beside a bias of .3 %."""
+    path = meshes.surface(*hands.hand(), 48).write_ply(tmp_path / "hand.ply")
+    shape = {"type": "ply", "filename": str(path), "face_normals": True, "to_world": mi.ScalarTransform4f().scale(9.0)}
     film = {"type": "hdrfilm", "width": 12, "height": 12, "rfilter": {"type": "box"}, "pixel_format": "rgba",
             "component_format": "float32"}  # fmt: skip
     view = mi.ScalarTransform4f().look_at([0, 10, 40], [0, 0, 0], [0, 1, 0])
     sensor = {"type": "perspective", "fov": 18.0, "to_world": view, "film": film}
     integrator = {"type": "translucent_walk", "light": "precomputed", "hide_emitters": True}
-    scene = _scene(
-        "precomputed", surface, shape, integrator=integrator, sensor=sensor, light={"type": "constant"}, **more
-    )
+    scene = _scene("precomputed", WHITE, shape, integrator=integrator, sensor=sensor, light={"type": "constant"})
     found = np.array([np.array(mi.render(scene, spp=4096, seed=k)).sum(axis=(0, 1)) for k in range(8)])
     ratio = found[:, :3] / found[:, 3:]
     error = ratio.std(axis=0, ddof=1) / np.sqrt(len(ratio))
-    assert (error < known_to).all(), error
+    assert (error < 0.004).all(), error
     assert (np.abs(ratio.mean(axis=0) - 1) < 0.003 + WIDEST_Z * error).all(), ratio.mean(axis=0)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shape", ["bowl", "hand"])
-def test_a_hollow_or_branching_object_without_absorption_is_invisible_in_uniform_light(
-    shape: str, tmp_path: Path
-) -> None:
-    _furnace(_mesh(shape, tmp_path), 0.004)
-
-
-@pytest.mark.slow
-def test_a_bubble_and_a_second_medium_without_absorption_are_invisible_in_uniform_light() -> None:
-    _furnace(_ball(), 0.008, bubble=_held("bubble", 1.8, 1.5), medium=_held("medium", -1.8, 1.5))
-
-
-@pytest.mark.slow
-def test_a_ball_half_in_glass_without_absorption_is_invisible_in_uniform_light() -> None:
-    _furnace(_ball(), 0.004, {**WHITE, "priority": -1.0}, glass=_block())
-
-
-def _pair() -> tuple[dict, dict]:
-    """Two balls beside each other."""
-    return _ball(2.5, center=[-2.5, 0, 0]), _ball(2.5, center=[2.5, 0, 0])
-
-
-@pytest.mark.slow
-def test_two_balls_that_touch_without_absorption_are_invisible_in_uniform_light() -> None:
-    one, other = _pair()
-    _furnace(one, 0.004, other={**other, "bsdf": {"type": "translucent", **WHITE}})
-
-
-@pytest.mark.slow
 def test_precomputed_light_of_two_balls_that_touch_has_the_mean_of_sampled_light() -> None:
-    one, other = _pair()
-    other["bsdf"] = {"type": "translucent", **MEDIUM, "sigma_s": "2.0,1.0,0.7"}
-    _compare(MEDIUM, 0.02, one, other=other, lamp=_lamp())
+    other = {**_ball(2.5, center=[2.5, 0, 0]), "bsdf": {"type": "translucent", **MEDIUM, "sigma_s": "2.0,1.0,0.7"}}
+    _compare(MEDIUM, 0.02, _ball(2.5, center=[-2.5, 0, 0]), other=other, lamp=_lamp())
 
 
 def test_precomputed_light_of_a_lamp_has_the_mean_of_sampled_light() -> None:
@@ -283,7 +246,7 @@ def test_a_lamp_that_looks_small_from_a_part_of_a_ball_has_the_same_mean_by_samp
     """Connections are made at events from which it does, and nowhere else."""
     lamp = {"type": "sphere", "center": [-19, 20, 10], "radius": 8.0, "emitter": {"type": "area", "radiance": 6.0}}
     ball, medium = _ball(4.0), {"sigma_s": 1.0, "sigma_a": 0.02, "eta": 1.5}
-    _compare(medium, 0.006, ball, spp=16384, lamp=lamp)  # 2.4 % too bright if asked at the events after those
+    _compare(medium, 0.006, ball, spp=16384, fewer=8, lamp=lamp)  # 2.4 % too bright if asked at the events after those
 
 
 @pytest.mark.slow
@@ -294,7 +257,7 @@ def test_precomputed_light_around_what_lies_inside_has_the_mean_of_sampled_light
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", ["in glass", "two media", "forward"])
+@pytest.mark.parametrize("case", ["two media", "forward in glass"])
 def test_precomputed_light_where_things_overlap_has_the_mean_of_sampled_light(case: str) -> None:
     """Light comes by way of glass and of the other object, too."""
     lights = {"lamp": _lamp(), "sky": {"type": "constant", "radiance": 0.3}}
@@ -302,8 +265,7 @@ def test_precomputed_light_where_things_overlap_has_the_mean_of_sampled_light(ca
         other = {**_ball(4.0, center=[2.5, 0, 0]), "bsdf": {"type": "translucent", **WHITE, "priority": 1.0}}
         _compare(MEDIUM, 0.02, _ball(4.0, center=[-2, 0, 0]), 512, other=other, **lights)
         return
-    surface = {**MEDIUM, "g": 0.6 if case == "forward" else 0.0, "priority": -1.0}
-    _compare(surface, 0.02, _ball(), 512, glass=_block(), **lights)
+    _compare({**MEDIUM, "g": 0.6, "priority": -1.0}, 0.02, _ball(), 512, glass=_block(), **lights)
 
 
 @pytest.mark.slow
@@ -316,31 +278,19 @@ def test_precomputed_light_has_the_mean_of_sampled_light_where_forward_scatterin
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", ["cube", "sky", "point", "sun", "floor", "two", "instances", "rough", "albedo"])
+@pytest.mark.parametrize("case", ["point", "floor", "instances", "albedo"])
 def test_precomputed_light_has_the_mean_of_sampled_light(case: str) -> None:
     lamp, floor = {"lamp": _lamp()}, {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": 0.6}}
     floor["to_world"] = mi.ScalarTransform4f().translate([0, -5.2, 0]).rotate([1, 0, 0], -90).scale(30)
-    if case == "cube":
-        _compare(MEDIUM, 0.02, _cube(), **lamp)
-    elif case == "sky":
-        _compare(MEDIUM, 0.004, light={"type": "constant"})
-    elif case == "point":
+    if case == "point":
         _compare(MEDIUM, 0.02, light={"type": "point", "position": [20, 25, 10], "intensity": 900.0})
-    elif case == "sun":
-        _compare(MEDIUM, 0.02, light={"type": "directional", "direction": [-1, -2, -0.5], "irradiance": 3.0})
     elif case == "floor":
         _compare(MEDIUM, 0.02, spp=256, floor=floor, **lamp)
-    elif case == "two":
-        other = {**_ball(3.0, center=[8, -1, 5]), "bsdf": {"type": "translucent", **MEDIUM, "sigma_s": "2.0,1.0,0.7"}}
-        _compare(MEDIUM, 0.02, other=other, **lamp)
     elif case == "instances":
         group = {"type": "shapegroup", "part": {**_ball(2.0), "bsdf": {"type": "translucent", **MEDIUM}}}
         mirror = mi.ScalarTransform4f().translate([7, 5, 3]).scale([-1, 1.5, 1])
         shown = {"type": "instance", "to_world": mirror, "group": {"type": "ref", "id": "group"}}
         _compare(MEDIUM, 0.02, spp=2048, group=group, shown=shown, **lamp)
-    elif case == "rough":
-        _compare({**MEDIUM, "boundary": {"type": "roughdielectric", "alpha": 0.3, "int_ior": 1.4, "ext_ior": 1.0}},
-                 0.02, **lamp)  # fmt: skip
     else:
         _compare(PAINTED, 0.01, _cube(), **lamp)
 
@@ -369,7 +319,7 @@ FORWARD = {"sigma_s": "10.0,15.0,20.0", "sigma_a": "0.01,0.05,0.3", "eta": 1.4}
 )
 def test_precomputed_light_of_an_even_sky_has_the_mean_of_sampled_light_at_any_g(g: str) -> None:
     surface = {**(MEDIUM if g == "-0.6" else FORWARD), "g": g}
-    _compare(surface, 0.003, _ball(3.0), spp=512, light={"type": "constant"})
+    _compare(surface, 0.003, _ball(3.0), spp=512, fewer=1, light={"type": "constant"})
 
 
 @pytest.mark.slow
@@ -379,7 +329,7 @@ def test_precomputed_light_of_a_lamp_has_the_mean_of_sampled_light_where_scatter
     lamp = {"lamp": _lamp(15.0)}
     if case == "rough":
         rough = {"type": "roughdielectric", "alpha": 0.3, "int_ior": 1.4, "ext_ior": 1.0}
-        _compare({**FORWARD, "g": 0.8, "boundary": rough}, 0.012, **lamp)
+        _compare({**FORWARD, "g": 0.8, "boundary": rough}, 0.012, fewer=1, **lamp)
     else:  # 5 mean free paths
         _compare({**MEDIUM, "g": 0.9}, 0.02, _ball(2.0), spp=6144, **lamp)
 
@@ -394,15 +344,12 @@ def test_light_of_a_window_has_a_fraction_of_the_noise_of_sampled_light() -> Non
     assert noise[0] < 0.05 * noise[1]  # .06 if walks went on beyond their third event
 
 
-@pytest.mark.parametrize(("lamp", "is_mesh"), [(0.2, False), (0.005, True)])
-def test_the_mirror_image_of_a_lamp_that_fills_a_small_part_of_a_pixel_is_found(
-    lamp: float, is_mesh: bool, tmp_path: Path
-) -> None:
+def test_the_mirror_image_of_a_lamp_that_fills_a_small_part_of_a_pixel_is_found(tmp_path: Path) -> None:
     """F L times the area of the image in a mirror of focal length R / 2, in pixels; R = 5, the lamp 29 away, F = 0.0293
-    at 31 degrees. A thirtieth of a pixel, or on a mesh a fifty thousandth."""
-    light = _lamp(lamp)
-    light["emitter"]["radiance"] *= (0.2 / lamp) ** 2
-    shape = {"type": "ply", "filename": _mesh_ball(tmp_path)} if is_mesh else None
+    at 31 degrees. A fifty thousandth of a pixel, on a mesh."""
+    light = _lamp(0.005)
+    light["emitter"]["radiance"] *= (0.2 / 0.005) ** 2
+    shape = {"type": "ply", "filename": _mesh_ball(tmp_path)}
     image = np.array(mi.render(_scene("precomputed", MEDIUM, shape, pixels=64, lamp=light), spp=32, seed=1)).sum(axis=2)
     row, column = np.unravel_index(image.argmax(), image.shape)
     glint = image[row - 1 : row + 2, column - 1 : column + 2].sum() - 9 * np.median(image[image > 0])
