@@ -14,13 +14,11 @@ import numpy as np
 from halfspace_sss.arrays import Library, Real, asks_nothing, broadcast_query, is_torch, labelled
 from halfspace_sss.checks import check_query
 from halfspace_sss.interface.query import Query
-from halfspace_sss.lazy import once
 from halfspace_sss.physics.fresnel import C_phi, F_t
 from halfspace_sss.physics.medium import Medium
 
 if TYPE_CHECKING:
     import torch
-    from torch.autograd.function import FunctionCtx
 
 FARTHEST = 0.44  # of the exponent range: in mean free paths, where r² is finite and r⁻³ is 0 in every precision
 
@@ -328,18 +326,18 @@ def recorded_in_blocks(lib: Library, f: Callable[..., Real], args: tuple[Real, .
     """f(*args), a function of each query alone, so that torch keeps the arguments for its derivatives and no more.
     torch keeps what every operation was given, tens of kB a query where a model integrates. Queries that would exceed
     `BLOCK_BYTES` are therefore split, and each block is recorded when it is gone through backwards. Other libraries,
-    and what is not differentiated or depends on further tensors that are, are answered at once."""
+    and what is not differentiated, are answered at once."""
     if not _recorded(lib, args):
         return f(*args)
+    from torch.utils.checkpoint import checkpoint
+
     torch, shape = lib.torch, args[0].shape
     flat = [a.reshape(-1) for a in args]
-    if f(*(a[:1].detach() for a in flat)).requires_grad:
-        return f(*args)
     size = max(PROBE, int(BLOCK_BYTES / max(_kept_bytes(torch, f, flat), 1.0)))
     if len(flat[0]) <= size:
         return f(*args)
     blocks = zip(*(a.split(size) for a in flat))
-    values = torch.cat([_block_class().apply(f, *block) for block in blocks])
+    values = torch.cat([checkpoint(f, *b, use_reentrant=False, preserve_rng_state=False) for b in blocks])
     return values.reshape(*shape, *values.shape[1:])
 
 
@@ -370,30 +368,3 @@ def _kept_bytes(torch: ModuleType, f: Callable[..., Real], flat: list) -> float:
         sizes.append(sum(kept.values()))
         del graph
     return (sizes[1] - sizes[0]) / PROBE
-
-
-@once
-def _block_class() -> type:
-    import torch
-
-    class Block(torch.autograd.Function):
-        """f(*args), recorded when its derivatives are asked for; those of higher order are recorded whole."""
-
-        @staticmethod
-        def forward(ctx: FunctionCtx, f: Callable[..., Real], *args: torch.Tensor) -> torch.Tensor:
-            ctx.f = f
-            ctx.save_for_backward(*args)
-            return f(*args)
-
-        @staticmethod
-        def backward(ctx: FunctionCtx, outer: torch.Tensor) -> tuple:
-            again, needed = torch.is_grad_enabled(), ctx.needs_input_grad[1:]
-            args = [a if again else a.detach().requires_grad_(n) for a, n in zip(ctx.saved_tensors, needed)]
-            inputs = [a for a, n in zip(args, needed) if n]
-            with torch.enable_grad():
-                value = ctx.f(*args)
-                result = torch.autograd.grad(value, inputs, outer, create_graph=again, allow_unused=True)
-            grads = iter(result)
-            return None, *(next(grads) if n else None for n in needed)
-
-    return Block
