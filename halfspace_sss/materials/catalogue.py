@@ -38,37 +38,14 @@ class Registry:
         self._complete = False
         self._lock = threading.RLock()
 
-    def names(self) -> list[str]:
-        """Names of all materials, sorted."""
-        return sorted(material.name for material in self._all().values())
-
-    def load(self, name: str) -> Material:
-        """The material of that name, whatever its case and separators; ValueError with the nearest names if none."""
-        materials = self._all()
-        if not isinstance(name, str):
-            raise ValueError(f"material must be a name, got {name!r}")
-        if key_of(name) not in materials:
-            hint = did_you_mean(key_of(name), {key: m.name for key, m in materials.items()}, most=3)
-            hint = hint or "; `halfspace-sss materials list` lists them"
-            raise ValueError(f"material must be one of the {len(materials)} registered, got {name!r}{hint}")
-        return materials[key_of(name)]
-
-    def register(self, material_or_path: Material | str | os.PathLike[str]) -> tuple[str, ...]:
-        """Add a material, or those of a TOML file or folder; returns their names."""
-        if isinstance(material_or_path, Material):
-            results = [(IN_CODE, material_or_path)]
-        elif isinstance(material_or_path, (str, os.PathLike)):
-            results = list(_from_path(material_or_path))
-        else:
-            raise ValueError(f"material_or_path must be a Material or a path, got {material_or_path!r}")
-        if not results:
-            raise ValueError(f"material_or_path must hold at least one *.toml file, got {str(material_or_path)!r}")
+    def add(self, results: list[tuple[str, Material]]) -> None:
+        """Add materials, each behind what it comes from."""
         with self._lock:
-            self._all()
+            self.all()
             self._materials, self._origins = self._with(results, (self._materials, self._origins))
-        return tuple(material.name for _, material in results)
 
-    def _all(self) -> dict[str, Material]:
+    def all(self) -> dict[str, Material]:
+        """All materials by key."""
         with self._lock:
             if not self._complete:
                 self._materials, self._origins = self._read()
@@ -162,7 +139,7 @@ def names() -> list[str]:
     Raises:
         ValueError: a material file of the user is refused.
     """
-    return _registry.names()
+    return sorted(material.name for material in _registry.all().values())
 
 
 def load(name: str, *, dilution: float | None = None, g: float | Sequence[float] | None = None) -> Material:
@@ -178,7 +155,14 @@ def load(name: str, *, dilution: float | None = None, g: float | Sequence[float]
         ValueError: no such material (the nearest names are given), or dilution or g is out of range or has no meaning
             for this material.
     """
-    material = _registry.load(name)
+    materials = _registry.all()
+    if not isinstance(name, str):
+        raise ValueError(f"material must be a name, got {name!r}")
+    if key_of(name) not in materials:
+        hint = did_you_mean(key_of(name), {key: m.name for key, m in materials.items()}, most=3)
+        hint = hint or "; `halfspace-sss materials list` lists them"
+        raise ValueError(f"material must be one of the {len(materials)} registered, got {name!r}{hint}")
+    material = materials[key_of(name)]
     if g is not None:
         material = material.with_g(g)
     return material if dilution is None else material.diluted(dilution)
@@ -192,7 +176,16 @@ def register(material_or_path: Material | str | os.PathLike[str]) -> tuple[str, 
     Raises:
         ValueError: a file is refused (file, key, bound and value are named) or a name is taken; nothing is added then.
     """
-    return _registry.register(material_or_path)
+    if isinstance(material_or_path, Material):
+        results = [(IN_CODE, material_or_path)]
+    elif isinstance(material_or_path, (str, os.PathLike)):
+        results = list(_from_path(material_or_path))
+    else:
+        raise ValueError(f"material_or_path must be a Material or a path, got {material_or_path!r}")
+    if not results:
+        raise ValueError(f"material_or_path must hold at least one *.toml file, got {str(material_or_path)!r}")
+    _registry.add(results)
+    return tuple(material.name for _, material in results)
 
 
 def write(path: str | os.PathLike[str], *materials: Material) -> None:
@@ -258,8 +251,8 @@ def table() -> pandas.DataFrame:
     import pandas
 
     rows = []
-    for name in _registry.names():
-        material = _registry.load(name)
+    for name in names():
+        material = load(name)
         medium = material.medium
         for i, channel in enumerate(material.channels or ("",)):
             row = {"material": name, "set": material.set, "channel": channel}

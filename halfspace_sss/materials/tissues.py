@@ -40,29 +40,6 @@ def _table(name: str) -> np.ndarray:
     return np.loadtxt(io.StringIO("\n".join(lines)), delimiter=",").T
 
 
-def _blood(wavelengths: np.ndarray, oxygenation: float) -> np.ndarray:
-    nm, oxy, deoxy = _table("hemoglobin")
-    extinction = oxygenation * oxy + (1 - oxygenation) * deoxy
-    return math.log(10) * HAEMOGLOBIN / 10 * np.interp(wavelengths, nm, extinction)
-
-
-def _water(wavelengths: np.ndarray) -> np.ndarray:
-    nm, k = _table("water")
-    return 4 * np.pi * np.interp(wavelengths, nm, k) / (wavelengths * 1e-6)
-
-
-def _fat(wavelengths: np.ndarray) -> np.ndarray:
-    return np.interp(wavelengths, *_table("fat")) / 10
-
-
-def _melanosome(wavelengths: np.ndarray) -> np.ndarray:
-    return 6.6e10 * wavelengths**-3.33
-
-
-def _baseline(wavelengths: np.ndarray) -> np.ndarray:
-    return 0.0244 + 8.53 * np.exp(-(wavelengths - 154) / 66.2)
-
-
 def tissue(
     a_prime: float,
     f_rayleigh: float,
@@ -109,8 +86,13 @@ def tissue(
         what = "which the table of fat covers" if fat else "which the tables cover"
         raise ValueError(f"wavelengths must be in [{low:g}, {high:g}] nm, {what}, got {outside[0]:g}")
     scattering = a_prime * (f_rayleigh * (nm / 500) ** -4 + (1 - f_rayleigh) * (nm / 500) ** -b_mie)
-    absorption = blood * _blood(nm, oxygenation) + water * _water(nm) + melanosomes * _melanosome(nm)
-    absorption += (fat * _fat(nm) if fat else 0.0) + ((1 - melanosomes) * _baseline(nm) if baseline else 0.0)
+    known, oxy, deoxy = _table("hemoglobin")
+    mixed = np.interp(nm, known, oxygenation * oxy + (1 - oxygenation) * deoxy)
+    absorption = blood * (math.log(10) * HAEMOGLOBIN / 10 * mixed)
+    absorption = absorption + water * (4 * np.pi * np.interp(nm, *_table("water")) / (nm * 1e-6))
+    absorption = absorption + melanosomes * (6.6e10 * nm**-3.33)
+    skin = (1 - melanosomes) * (0.0244 + 8.53 * np.exp(-(nm - 154) / 66.2)) if baseline else 0.0
+    absorption += (fat * (np.interp(nm, *_table("fat")) / 10) if fat else 0.0) + skin
     cosine = np.broadcast_to(g(nm) if callable(g) else g, nm.shape)
     return SpectralMedium(nm, scattering / (1 - cosine), absorption, cosine, n, source="Jacques 2013")
 
@@ -135,10 +117,6 @@ class Tissue:
 def _skin_g(wavelengths: np.ndarray) -> np.ndarray:
     """Mean cosine of skin, 0.62 + 0.29e-3 l / nm (van Gemert et al. 1989)."""
     return 0.62 + 0.29e-3 * wavelengths
-
-
-def _dentine() -> SpectralMedium:
-    return SpectralMedium([543, 632, 1053], [28.0, 28.0, 26.0], 0.35, 0.93, 1.54, source="Fried et al. 1995")
 
 
 _MAKERS: dict[str, Callable[[], Tissue]] = {
@@ -174,7 +152,7 @@ _MAKERS: dict[str, Callable[[], Tissue]] = {
         (),
     ),
     "dentine": lambda: Tissue(
-        _dentine(),
+        SpectralMedium([543, 632, 1053], [28.0, 28.0, 26.0], 0.35, 0.93, 1.54, source="Fried et al. 1995"),
         {"sigma_a": (0.3, 0.4)},
         "D. Fried, R. E. Glena, J. D. B. Featherstone and W. Seka, Appl. Opt. 34, 1278-1285 (1995), 543 to 1053 nm",
         ("sigma_a: middle of the range", "n: 1.54"),
