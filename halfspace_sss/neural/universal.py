@@ -100,11 +100,6 @@ class Hypernetwork:
     def shapes(self) -> list[tuple[int, int]]:
         return layer_shapes(N_FEATURES, self.width, self.depth)
 
-    def parameters(self) -> dict[str, np.ndarray]:
-        """Arrays by name, for the file of weights."""
-        layers = {**named_layers("medium", self.medium_layers), **named_layers(CALIBRATION, self.calibration_layers)}
-        return {**layers, "base": self.base, "basis": self.basis}
-
 
 def named_layers(name: str, layers: Layers) -> dict[str, np.ndarray]:
     """Matrices and biases by name, for the file of weights."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 import functools
 import math
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from types import ModuleType
 
@@ -18,12 +17,12 @@ import numpy as np
 
 from halfspace_sss.arrays import aligned
 from halfspace_sss.backend import array_types
-from halfspace_sss.checks import as_count, check_choice, check_cosine, check_count, check_interval
+from halfspace_sss.checks import check_choice
 from halfspace_sss.lazy import LazyModule
 from halfspace_sss.physics.fresnel import F_r, mu_internal
 from halfspace_sss.physics.medium import Layers, sample_hg
 from halfspace_sss.progress import Progress
-from halfspace_sss.tracing.passes import BATCHES, CellSums, Estimate, checked_radii, estimate, find_cell, walk_passes
+from halfspace_sss.tracing.passes import BATCHES, CellSums, Estimate, estimate, find_cell, is_certain, walk_passes
 from halfspace_sss.tracing.walk import Boundary, generator, in_launches, roulette, turn
 
 dr = LazyModule("drjit")
@@ -112,28 +111,10 @@ def _of_order(order: str, samples: np.ndarray, axis: int) -> np.ndarray:
 
 
 def trace_layers(
-    layers: Layers,
-    mu_i: float | str = 1.0,
-    n_paths: int = 1_000_000,
-    seed: int = 0,
-    *,
-    radii: Sequence[float] | None = None,
-    backend: str = "llvm",
-    relative_error: float | None = None,
-    progress: Progress | None = None,
-) -> LayerTrace:
-    """Trace walks of a beam in layers; `trace` calls this for `Layers`, and has the arguments.
-
-    Raises:
-        ValueError: an argument is out of range; nothing has been traced then.
-    """
-    if mu_i != "diffuse":
-        mu_i = check_cosine("mu_i", mu_i)
-    n_paths = as_count("n_paths", n_paths, 256)
-    check_count("seed", seed, 0)
-    if relative_error is not None:
-        check_interval("relative_error", relative_error, 1e-6, 1)
-    edges = checked_radii(radii, mu_i)
+    layers: Layers, mu_i: float | str, n_paths: int, seed: int, edges: np.ndarray | None, backend: str,
+    relative_error: float | None, progress: Progress | None,
+) -> LayerTrace:  # fmt: skip
+    """Trace walks of a beam in layers: `trace` for `Layers`, whose arguments it has checked."""
     types, started = array_types(backend), time.perf_counter()
     beam = types, layers, mu_i, n_paths, (seed,)
     walk = functools.partial(_walk, diffuse=mu_i == "diffuse")
@@ -145,8 +126,7 @@ def trace_layers(
         if edges is not None:
             rings.append(scale * tally.rings.result().reshape(BATCHES, len(layers) + 1, 3, -1))
         events, paths = events + done.n_events, paths + done.n_paths
-        R = estimate(np.concatenate(samples)[:, : 3 * len(layers)].sum(axis=1))
-        if relative_error and R.standard_error <= relative_error * R.value:
+        if relative_error and is_certain(np.concatenate(samples)[:, : 3 * len(layers)], relative_error):
             break
     n, result = len(layers), np.concatenate(samples)
     areas = None if edges is None else np.pi * np.diff(edges**2)

@@ -238,6 +238,12 @@ def estimate(samples: np.ndarray) -> Estimate:
     return Estimate(float(value), float(error)) if samples.ndim == 1 else Estimate(value, error)
 
 
+def is_certain(parts: np.ndarray, relative_error: float) -> bool:
+    """Whether the sum of parts (samples, parts) is known to a relative standard error."""
+    total = estimate(parts.sum(axis=1))
+    return total.standard_error <= relative_error * total.value
+
+
 def ratio_estimate(moment: np.ndarray, flux: np.ndarray, unit: float) -> Estimate:
     """The mean of a moment over that of the flux, of independent samples, times a unit; NaN without flux."""
     if not flux.mean() > 0:

@@ -28,6 +28,7 @@ from halfspace_sss.tracing.passes import (
     RingTally,
     checked_radii,
     estimate,
+    is_certain,
     order_sum,
     ratio_estimate,
     walk_passes,
@@ -191,16 +192,6 @@ def trace(
     Raises:
         ValueError: an argument is out of range; nothing has been traced then.
     """
-    if isinstance(medium, Layers):
-        for name, value in (("directions", directions), ("instrument", instrument)):
-            if value is not None:
-                raise ValueError(f"{name} must be left out for layers, got {value!r}")
-        return trace_layers(
-            medium, mu_i, n_paths, seed,
-            radii=radii, backend=backend, relative_error=relative_error, progress=progress,
-        )  # fmt: skip
-    medium = medium_of(medium)
-    check_scalar_medium(medium)
     n_paths = as_count("n_paths", n_paths, 256)
     check_count("seed", seed, 0)
     if mu_i != "diffuse":
@@ -208,6 +199,13 @@ def trace(
     if relative_error is not None:
         check_interval("relative_error", relative_error, 0.0, 1.0)
     edges = checked_radii(radii, mu_i)
+    if isinstance(medium, Layers):
+        for name, value in (("directions", directions), ("instrument", instrument)):
+            if value is not None:
+                raise ValueError(f"{name} must be left out for layers, got {value!r}")
+        return trace_layers(medium, mu_i, n_paths, seed, edges, backend, relative_error, progress)
+    medium = medium_of(medium)
+    check_scalar_medium(medium)
     pairs = _checked_directions(directions, mu_i)
     if mu_i == "diffuse" and instrument is not None:
         raise ValueError(f"instrument must be None for diffuse light, which is no beam, got {instrument!r}")
@@ -227,7 +225,7 @@ def trace(
         if edges is not None:
             rings.append(done.cells(done.tallies[2 + (pairs is not None)].cells).reshape(-1, 2, len(edges) - 1))
         events, paths = events + done.n_events, paths + done.n_paths
-        if relative_error and _is_certain(rows, relative_error):
+        if relative_error and is_certain(np.concatenate(rows)[:, :2], relative_error):
             break
     exitance = None if edges is None else np.concatenate(rings) / (np.pi * np.diff(edges**2))
     return Trace(
@@ -236,12 +234,6 @@ def trace(
         _lanes=np.concatenate(rows), _rings=exitance, _radii=edges,
         _n_directions=0 if pairs is None else len(pairs), _T_o=None if pairs is None else F_t(pairs[:, 0], medium.eta),
     )  # fmt: skip
-
-
-def _is_certain(rows: list[np.ndarray], relative_error: float) -> bool:
-    """Whether the total reflectance of all passes so far has this relative standard error."""
-    R = estimate(np.concatenate(rows)[:, :2].sum(axis=1))
-    return R.standard_error <= relative_error * R.value
 
 
 def _checked_directions(directions: Sequence[tuple[float, float]] | None, mu_i: float | str) -> np.ndarray | None:

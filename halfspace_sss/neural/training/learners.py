@@ -16,6 +16,7 @@ from torch import nn
 from halfspace_sss.arrays import Library, library
 from halfspace_sss.maps.noisy_maps import CellGrid, Groups, backbone_mass, radial_edges
 from halfspace_sss.neural.network import (
+    LOG_RANGE,
     N_FEATURES,
     N_MEDIUM,
     RELU,
@@ -145,9 +146,6 @@ def _smooth(energy: np.ndarray) -> np.ndarray:
     """Mean over five neighbours in u: the noise of a map must not decide where it is looked at."""
     padded = np.pad(energy, ((0, 0), (2, 2)), mode="edge")
     return sum(padded[:, k : k + energy.shape[1]] for k in range(5)) / 5
-
-
-LOG_RANGE = 30.0
 
 
 def cell_loss(p: torch.Tensor, y: torch.Tensor, weight: Callable[[torch.Tensor], torch.Tensor]) -> torch.Tensor:

@@ -7,7 +7,6 @@ import os
 import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -15,8 +14,8 @@ import torch
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.comparison.model_errors import ModelError, ReferenceSize, model_error, reference_maps
-from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.maps.noisy_maps import CellGrid, Groups, draw_directions, make_pool
+from halfspace_sss.materials import load
 from halfspace_sss.neural import material_model, paper_model
 from halfspace_sss.neural.material_model import network_arrays
 from halfspace_sss.neural.network import Network, SymmetricModel, channels
@@ -75,27 +74,69 @@ class TrainedChannel:
     fit_seconds: float
 
 
-Trainee = Small | PaperLearner  # torch modules with `loss`, `network`, `width` and `depth`
+class Trial(SymmetricModel):
+    """A network under training as a model."""
+
+    name = "trial"
+    source = "under training"
+
+    def __init__(self, medium: Medium, network: Network) -> None:
+        super().__init__(medium)
+        self.networks: list[Network] = [network]
 
 
-class ModelTraining(Protocol):
-    """What is trained: a kind of model, with its learner and how the learner answers as a model."""
+class MaterialTraining:
+    """What `neural_material` learns by, and how it then answers as a model.
+    It starts from what the universal network says of the medium, where it says anything.
 
-    kind: str
+    Args:
+        warm: False to start from random numbers.
+    """
 
-    def learner(self, medium: Medium, pool: MapPool, seed: int) -> Trainee:
-        """What is fitted to the maps of a medium."""
+    kind = material_model.KIND
 
-    def model(self, medium: Medium, learner: Trainee) -> BSSRDF:
-        """The learner as it is, as a model."""
+    def __init__(self, warm: bool = True) -> None:
+        self.warm = warm
 
-    def record(self, learner: Trainee) -> JsonDict:
-        """What must be known beside the network to load it."""
+    def learner(self, medium: Medium, pool: MapPool, seed: int) -> Small:
+        start = None
+        if self.warm and in_range(medium) and shipped_weights().exists():
+            hyper = load_hypernetwork(shipped_weights())
+            start = hyper.network(float(medium.albedo), float(medium.g), medium.eta)
+        return Small(seed=seed, start=start)
+
+    def model(self, medium: Medium, learner: Small) -> Trial:
+        return Trial(medium, learner.network())
+
+    def record(self, learner: Small) -> JsonDict:
+        return {"warm_start": self.warm}
+
+
+class PaperTraining:
+    """`neural_paper`: 3 x 256, raw S, squared error."""
+
+    kind = paper_model.KIND
+
+    def learner(self, medium: Medium, pool: MapPool, seed: int) -> PaperLearner:
+        probe = PaperLearner(medium, 1.0, width=1)
+        batch = pool.batch(64, 1024, torch.Generator().manual_seed(0))
+        S = probe.S_over_y(batch)[:, : batch.y.shape[1]] * batch.y
+        return PaperLearner(medium, max(math.sqrt(float((S**2).mean())), 1e-20), seed=seed)
+
+    def model(self, medium: Medium, learner: PaperLearner) -> NeuralPaper:
+        return NeuralPaper(medium, [(learner.network(), learner.scale)])
+
+    def record(self, learner: PaperLearner) -> JsonDict:
+        return {"scale": learner.scale}
+
+
+Training = MaterialTraining | PaperTraining
+TRAININGS: dict[str, Training] = {"neural_material": MaterialTraining(), "neural_paper": PaperTraining()}
 
 
 def train_channel(
     medium: Medium,
-    training: ModelTraining,
+    training: Training,
     recipe: MaterialRecipe = STANDARD,
     seed: int = 0,
     *,
@@ -177,69 +218,6 @@ def _record(
     }  # fmt: skip
 
 
-WIDEST_IN_DRJIT = 64  # a network 256 wide runs three times as fast in NumPy
-
-
-class Trial(SymmetricModel):
-    """A network under training as a model."""
-
-    name = "trial"
-    source = "under training"
-
-    def __init__(self, medium: Medium, network: Network) -> None:
-        super().__init__(medium)
-        self.networks: list[Network] = [network]
-        if network.matrices[0].shape[1] > WIDEST_IN_DRJIT:
-            self.fast_in = "numpy"
-
-
-class MaterialTraining:
-    """`neural_material`, started from what the universal network says of the medium, where it says anything.
-
-    Args:
-        warm: False to start from random numbers.
-    """
-
-    kind = material_model.KIND
-
-    def __init__(self, warm: bool = True) -> None:
-        self.warm = warm
-
-    def learner(self, medium: Medium, pool: MapPool, seed: int) -> Small:
-        start = None
-        if self.warm and in_range(medium) and shipped_weights().exists():
-            hyper = load_hypernetwork(shipped_weights())
-            start = hyper.network(float(medium.albedo), float(medium.g), medium.eta)
-        return Small(seed=seed, start=start)
-
-    def model(self, medium: Medium, learner: Small) -> Trial:
-        return Trial(medium, learner.network())
-
-    def record(self, learner: Small) -> JsonDict:
-        return {"warm_start": self.warm}
-
-
-class PaperTraining:
-    """`neural_paper`: 3 x 256, raw S, squared error."""
-
-    kind = paper_model.KIND
-
-    def learner(self, medium: Medium, pool: MapPool, seed: int) -> PaperLearner:
-        probe = PaperLearner(medium, 1.0, width=1)
-        batch = pool.batch(64, 1024, torch.Generator().manual_seed(0))
-        S = probe.S_over_y(batch)[:, : batch.y.shape[1]] * batch.y
-        return PaperLearner(medium, max(math.sqrt(float((S**2).mean())), 1e-20), seed=seed)
-
-    def model(self, medium: Medium, learner: PaperLearner) -> NeuralPaper:
-        return NeuralPaper(medium, [(learner.network(), learner.scale)])
-
-    def record(self, learner: PaperLearner) -> JsonDict:
-        return {"scale": learner.scale}
-
-
-TRAININGS: dict[str, ModelTraining] = {"neural_material": MaterialTraining(), "neural_paper": PaperTraining()}
-
-
 def train(
     material: str | Medium,
     *,
@@ -274,7 +252,7 @@ def train(
     check_count("seed", seed, 0)
     if target_error is not None:
         check_interval("target_error", target_error, 1e-4, 1.0)
-    media = channels(_medium(material))
+    media = channels(material if isinstance(material, Medium) else load(material).medium)
     check_weights_folder(folder)
     if work is not None:
         check_folder(work)
@@ -286,11 +264,3 @@ def train(
         )
         for k, m in enumerate(media)
     ]  # fmt: skip
-
-
-def _medium(material: str | Medium) -> Medium:
-    if isinstance(material, Medium):
-        return material
-    from halfspace_sss.materials import load
-
-    return load(material).medium
