@@ -23,7 +23,7 @@ from benchmarks.speeds import VOLUMES, LitObject
 from benchmarks.total_error import BLOCK, PRECOMPUTED, image_of_pass, lit_scene
 from figures.computing.scans import prepare
 from figures.parts.part import Row
-from full_geometry.scenes.reference import Denoise, Halves
+from full_geometry.scenes.reference import Denoise, MixedHalves
 from full_geometry.scenes.reference_store import Reference
 from full_geometry.trade.denoising import Denoiser
 
@@ -98,10 +98,10 @@ def _row(case: LitObject, way: str, how: ErrorsWanted, folder: Path) -> Row:
 
 def _errors(found: Reference, denoise: Denoise) -> dict[str, float]:
     """Relative errors of pixels and blocks, denoised and raw; infinite where the image is not above its noise."""
-    mixed, mean, variance = Halves.of(found, denoise).mixed(), found.mean[..., :3], found.variance[..., :3]
+    mixed, mean, variance = MixedHalves.of(found, denoise), found.mean[..., :3], found.variance[..., :3]
     result = {}
     for name, size in (("pixels", 1), ("blocks", BLOCK)):
-        means = mixed.means(size)
+        means = MixedHalves(*(_means(x, size) for x in mixed))
         squared, noise = means.squared()
         # of the halves: cells of precomputed light share their noise among pixels
         raw = variance.sum() if size == 1 else 0.25 * np.square(means.A - means.B).sum()

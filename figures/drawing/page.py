@@ -152,11 +152,13 @@ def _address(pixels: np.ndarray, kind: str, **settings: bool | int) -> str:
 
 def render(picture: Picture) -> dict[str, bytes]:
     """{"html": page}, and with a denoised image {"denoised.exr", "denoised.png"}; on the page both can be flipped."""
+    from full_geometry.scenes.reference_store import as_exr, as_png
+
     shots, files = [Shot("rendered", np.maximum(picture.image, 0.0), dict(picture.numbers))], {}
     if picture.clean is not None:
         clean, numbers = picture.clean
         shots.append(Shot("denoised", np.maximum(clean, 0.0), dict(numbers)))
-        files = {"denoised.exr": picture.exr(clean), "denoised.png": picture.png(clean)}
+        files = {"denoised.exr": as_exr(clean), "denoised.png": as_png(clean)}
     text = page(picture.title, {picture.title: shots}, caption=picture.caption, lower_is_better=())
     return {"html": text.encode(), **files}
 

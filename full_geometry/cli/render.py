@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from full_geometry.learning.online import Listeners
     from full_geometry.scenes.reference import Limits
-    from full_geometry.scenes.reference_store import Picture, Reference
+    from full_geometry.scenes.reference_store import Reference
     from full_geometry.viewing.frames import Animation, Rows
 
 SPP, ASKED = 64, 0.02  # samples of a pixel of what is named, relative error of what is not
@@ -162,7 +162,7 @@ def _image(
 ) -> np.ndarray | None:
     """Render an image and write its files; None for a frame that is finished and gone on with."""
     from full_geometry.scenes.reference import cross_denoised
-    from full_geometry.scenes.reference_store import Picture
+    from full_geometry.scenes.reference_store import Picture, as_png
     from full_geometry.trade.denoising import Denoiser
 
     with one_writer(file):
@@ -179,7 +179,8 @@ def _image(
         colours = result.mean[..., :3] if result.mean.shape[2] >= 3 else result.mean[..., :1].repeat(3, axis=2)
         picture = Picture(file.stem, colours, told, error, off)
         drawn = drawers.render(picture) if drawers and (off or not images.frames) else {}
-        files = _publish(picture, file, {end: drawn[end] for end in drawn if not (images.frames and end == "html")})
+        drawn = {end: drawn[end] for end in drawn if not (images.frames and end == "html")}
+        files = _publish(file, {"png": as_png(colours), **drawn})
         shared.say(f"{result.spp} samples a pixel in {result.seconds:.1f} s; {error}")
         shared.say(*([clean.told] if clean else []))
         shared.say_files(files)
@@ -370,10 +371,9 @@ class _Bars:
         self.bar.show(round(1000 * self.limits.share(reference)), 1000, f"{reference.spp} spp{error}")
 
 
-def _publish(picture: Picture, file: Path, drawn: dict[str, bytes]) -> list[Path]:
+def _publish(file: Path, drawn: dict[str, bytes]) -> list[Path]:
     """Put the finished files in the place of those of before, all of one render at any moment; their paths."""
     part = _unfinished(file)
-    drawn = {"png": picture.png(), **drawn}
     for ending, data in drawn.items():
         write_atomically(part.with_suffix(f".{ending}"), data)
     phases = [ending for ending in PHASES if part.with_suffix(f".{ending}").exists()]

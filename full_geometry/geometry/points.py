@@ -444,7 +444,7 @@ class PositionSampler:
         piece = self.geometry.piece(prim_index, active)
         u_axis, u_length, u_face, u_choice = (sampler.next_1d() for _ in range(4))
         u = sampler.next_2d()
-        kept = _Kept(u_choice, mi.Float(0), *_nowhere())
+        kept = _Kept(u_choice, mi.Float(0), mi.Point3f(0), mi.Normal3f(0, 0, 1), mi.Normal3f(0, 0, 1), mi.UInt32(0))
         if self.probes:
             kept = self._hits(self._probe(out, axes, u_axis, u_length, u), out, axes, piece, kept, active)
         if self.area_points:
@@ -553,10 +553,6 @@ def wrapped(u: mi.Float) -> mi.Float:
     return dr.minimum(u - dr.floor(u), 1 - 2**-24)
 
 
-def _nowhere() -> tuple:
-    return mi.Point3f(0), mi.Normal3f(0, 0, 1), mi.Normal3f(0, 0, 1), mi.UInt32(0)
-
-
 # --------------------------------------------------------------------------------------------------
 # Points uniform over the area of an object, with its geometric and its shading normal.
 
@@ -663,22 +659,15 @@ class RadialTable:
         mass /= max(mass.sum(), 1e-300)
         probability = (1 - FLOOR) * mass + FLOOR / N_CELLS
         probability /= probability.sum()
-        self.r_min, self.reach = r_min, reach
-        self.per_log = (N_CELLS - 1) / math.log(reach / r_min)
         self.mean = float(np.sum(probability * middle))
-        self._numpy = (np.cumsum(probability), probability, edges, probability / (2 * math.pi * np.diff(edges)))
-        self._lanes: dict[str, tuple[mi.Float, ...]] = {}
-
-    def _arrays(self) -> tuple[mi.Float, ...]:
-        if mi.variant() not in self._lanes:
-            numbers = (opaque(v) for v in (self.r_min, self.per_log, self.reach))
-            self._lanes[mi.variant()] = (*(floats(v) for v in self._numpy), *numbers)
-            dr.eval(self._lanes[mi.variant()])
-        return self._lanes[mi.variant()]
+        tables = (np.cumsum(probability), probability, edges, probability / (2 * math.pi * np.diff(edges)))
+        numbers = (opaque(v) for v in (r_min, (N_CELLS - 1) / math.log(reach / r_min), reach))
+        self._arrays = (*map(floats, tables), *numbers)
+        dr.eval(self._arrays)
 
     def sample(self, u: mi.Float) -> mi.Float:
         """Distance r for uniform u in [0, 1)."""
-        cdf, probability, edges, *_ = self._arrays()
+        cdf, probability, edges, *_ = self._arrays
         k = dr.binary_search(0, N_CELLS - 1, lambda i: dr.gather(mi.Float, cdf, i) <= u)
         share = 1 - (dr.gather(mi.Float, cdf, k) - u) / dr.gather(mi.Float, probability, k)
         low, high = dr.gather(mi.Float, edges, k), dr.gather(mi.Float, edges, k + 1)
@@ -686,7 +675,7 @@ class RadialTable:
 
     def pdf(self, r: mi.Float) -> mi.Float:
         """Density over the plane at distance r, 1/(scene unit)²; 0 beyond the reach."""
-        *_, times_r, r_min, per_log, reach = self._arrays()
+        *_, times_r, r_min, per_log, reach = self._arrays
         steps = dr.log(dr.maximum(r, r_min) / r_min) * per_log
         k = dr.select(r < r_min, 0, dr.minimum(mi.UInt32(steps) + 1, N_CELLS - 1))
         density = dr.gather(mi.Float, times_r, k) / dr.maximum(r, 1e-3 * r_min)

@@ -287,10 +287,16 @@ def analyse_shape(shape: mi.Shape, world: mi.Scene | None = None, groups: Iterab
     if faces is not None:
         check_copies(faces, name_of(shape))
     votes = _Votes(faces)
-    sides, odd = _outside_view(scene, votes)
+    # of each ray from outside the side of its first hit, and how many do not leave what they enter
+    sides, count = (np.array(v) for v in crossings(scene, rays_into(scene.bbox(), RAYS), votes))
+    odd = float((count[count > 0] % 2).mean()) if (count > 0).any() else 0.0
     if faces is not None and faces.closed:
-        _check_pieces(shape, max(odd, votes.wrong()))
-        odd = 0.0  # rays pass between faces by rounding
+        wrong, odd = max(odd, votes.wrong()), 0.0  # rays pass between faces by rounding
+        if wrong > HIDDEN:
+            raise ValueError(
+                f"pieces of object {name_of(shape)} must not touch or overlap, got {100 * wrong:.3g} % of the hits of "
+                "rays inside others: join them, or move them apart"
+            )
     outward = sides[sides != 0]
     share = float((outward > 0).mean()) if len(outward) else 1.0
     sheet = 1 - MAJORITY < share < MAJORITY and not votes.agree()
@@ -316,15 +322,6 @@ def analyse_shape(shape: mi.Shape, world: mi.Scene | None = None, groups: Iterab
         pieces=votes.pieces, size=size, area=area, state=geometry_of(shape), lost=odd,
         group=next((group for group in groups if any(shape is part for part in group.shapes)), None),
     )  # fmt: skip
-
-
-def _check_pieces(shape: mi.Shape, wrong: float) -> None:
-    """Refuse a closed mesh where a share of the rays leaves what it did not enter: faces of it touch or overlap."""
-    if wrong > HIDDEN:
-        raise ValueError(
-            f"pieces of object {name_of(shape)} must not touch or overlap, got {100 * wrong:.3g} % of the hits of rays "
-            "inside others: join them, or move them apart"
-        )
 
 
 PLACES = (*mesh.GEOMETRY, "to_world", "grid", "control_points", "data", "extent")
@@ -385,14 +382,6 @@ class _Votes:
         sign = np.where(self._shares() < 0.5, -1.0, 1.0)[np.array(self.pieces)]
         sign = sign if self.sides is None else sign * np.array(self.sides)
         return aligned(mi.Float, sign) if np.ptp(sign) > 0 else None
-
-
-def _outside_view(scene: mi.Scene, votes: _Votes) -> tuple[np.ndarray, float]:
-    """Per ray the side of the normal at the first hit (1 towards the ray, 0 no hit); share of rays with odd hits."""
-    side, count = crossings(scene, rays_into(scene.bbox(), RAYS), votes)
-    side, count = np.array(side), np.array(count)
-    hit = count > 0
-    return side, float((count[hit] % 2).mean()) if hit.any() else 0.0
 
 
 def crossings(scene: mi.Scene, ray: mi.Ray3f, votes: _Votes | None = None) -> tuple[mi.Float, mi.UInt32]:

@@ -76,48 +76,8 @@ class Denoised(NamedTuple):
         return f"error of the denoised image {self.error:.2%} ± {self.standard_error:.2%}, bias of denoising included"
 
 
-class Halves(NamedTuple):
-    """Two halves of the samples, (H, W, 3).
-
-    Args:
-        A, B: their means.
-        V_A, V_B: variances of these.
-        D_A, D_B: both denoised.
-    """
-
-    A: np.ndarray
-    B: np.ndarray
-    V_A: np.ndarray
-    V_B: np.ndarray
-    D_A: np.ndarray
-    D_B: np.ndarray
-
-    @classmethod
-    def of(cls, found: Reference, denoise: Denoise) -> Halves:
-        """The halves of a render of at least two passes."""
-        # the variance of one sample is that of the mean times the samples
-        n, spp, variance = found.half_spp, found.spp, found.variance[..., :3]
-        A, B = found.half, (spp * found.mean - n * found.half) / (spp - n)
-        return cls(A[..., :3], B[..., :3], variance * (spp / n), variance * (spp / (spp - n)), denoise(A), denoise(B))
-
-    def held(self) -> tuple[np.ndarray, np.ndarray]:
-        """Estimates of e_A² and e_B² of the pixels, (H, W, 3): each denoised half held to the other."""
-        return (self.D_A - self.B) ** 2 - self.V_B, (self.D_B - self.A) ** 2 - self.V_A
-
-    def mixed(self) -> MixedHalves:
-        """P, Q and N, by the shares of the noisy halves that make errors least."""
-        # ---- differences from the denoised halves, and those of the noise, which cells of light share among pixels
-        A, B, noise = self.B - self.D_A, self.A - self.D_B, self.A - self.B
-        coarse = [gaussian_filter(x, (COARSE, COARSE, 0)) for x in (A, B, noise)]
-        s, s_coarse = (_share(*parts) for parts in ((A, B, noise), coarse))
-
-        # ---- K of each
-        P, Q, N = (s * x + (s_coarse - s) * low for x, low in zip((A, B, noise), coarse))
-        return MixedHalves(self.D_A + P, self.D_B + Q, N, self.A, self.B)
-
-
 class MixedHalves(NamedTuple):
-    """Halves with their shares of noise, (H, W, 3), as in the head of this module."""
+    """Halves of the samples, means A and B, with their shares of noise, (H, W, 3): see the head of this module."""
 
     P: np.ndarray
     Q: np.ndarray
@@ -125,10 +85,20 @@ class MixedHalves(NamedTuple):
     A: np.ndarray
     B: np.ndarray
 
-    def means(self, size: int) -> MixedHalves:
-        """Over blocks of `size` x `size` pixels; those at the ends that are not whole are left out."""
-        n, m = (length // size for length in self.P.shape[:2])
-        return MixedHalves(*(x[: n * size, : m * size].reshape(n, size, m, size, -1).mean(axis=(1, 3)) for x in self))
+    @classmethod
+    def of(cls, found: Reference, denoise: Denoise) -> MixedHalves:
+        """The halves of a render of at least two passes, by the shares of noise that make errors least."""
+        n, spp = found.half_spp, found.spp
+        A, B = found.half, (spp * found.mean - n * found.half) / (spp - n)
+        D_A, D_B, A, B = denoise(A), denoise(B), A[..., :3], B[..., :3]
+        # ---- differences from the denoised halves, and those of the noise, which cells of light share among pixels
+        to_B, to_A, noise = B - D_A, A - D_B, A - B
+        coarse = [gaussian_filter(x, (COARSE, COARSE, 0)) for x in (to_B, to_A, noise)]
+        s, s_coarse = (_share(*parts) for parts in ((to_B, to_A, noise), coarse))
+
+        # ---- K of each
+        P, Q, N = (s * x + (s_coarse - s) * low for x, low in zip((to_B, to_A, noise), coarse))
+        return cls(D_A + P, D_B + Q, N, A, B)
 
     def squared(self) -> tuple[np.ndarray, float]:
         """Estimates of e² of the pixels, (H, W, 3), and the part of their sum that is noise, not bias."""
@@ -155,8 +125,7 @@ def cross_denoised(found: Reference, denoise: Denoise) -> Denoised:
     """
     if found.half is None or found.passes < 2:
         return Denoised(denoise(found.mean), math.inf, math.inf)
-    halves = Halves.of(found, denoise)
-    mixed = halves.mixed()
+    mixed = MixedHalves.of(found, denoise)
     squared, noise = mixed.squared()
     squared = squared.sum(axis=2).ravel()
     whole = max(float(np.square(found.mean[..., :3]).sum() - found.variance[..., :3].sum()), 1e-30)

@@ -221,13 +221,6 @@ class Picture:
     caption: str
     clean: tuple[np.ndarray, Mapping[str, str]] | None = None
 
-    def png(self, image: np.ndarray | None = None) -> bytes:
-        """The image as a display shows it."""
-        return as_png(self.image if image is None else image)
-
-    def exr(self, image: np.ndarray) -> bytes:
-        return as_exr(image)
-
 
 def as_exr(image: np.ndarray) -> bytes:
     """Numbers (H, W, channels) as they are."""

@@ -143,15 +143,6 @@ def _check_grid(name: str, volume: mi.Volume, channels: int, most: float) -> Non
     _check_range(name, values, most)
 
 
-def mean_medium(medium: VaryingMedium, p: mi.Point3f, g: np.ndarray | float, eta: float) -> Medium:
-    """The homogeneous medium with the means of sigma_s and sigma_a over points."""
-    sigma_t, sigma_s = (values.astype(float).mean(axis=1) for values in medium.coefficients(p))
-    sigma_a = np.maximum(sigma_t - sigma_s, 0)
-    return (
-        Medium(sigma_s, sigma_a, g, eta) if len(sigma_s) > 1 else Medium(float(sigma_s[0]), float(sigma_a[0]), g, eta)
-    )
-
-
 def mean_of_grids(medium: VaryingMedium, g: np.ndarray | float, eta: float) -> Medium:
     """The homogeneous medium with the mean extinction and the mean albedo of the grids, before an object is known."""
     sigma_t, albedo = (
@@ -176,7 +167,10 @@ def equivalent(spec: Any, obj: Geometry) -> Any:
         within = np.array(crossings(obj.scene, ray)[1]) % 2 == 1
         if within.any():
             p = mi.Point3f(np.array(p)[:, within])
-    return replace(spec, medium=mean_medium(spec.varying, p, spec.medium.g, spec.medium.eta))
+    sigma_t, sigma_s = (values.astype(float).mean(axis=1) for values in spec.varying.coefficients(p))
+    sigma_a = np.maximum(sigma_t - sigma_s, 0)
+    pair = (v if len(v) > 1 else float(v[0]) for v in (sigma_s, sigma_a))
+    return replace(spec, medium=Medium(*pair, spec.medium.g, spec.medium.eta))
 
 
 def warn_of_means(spec: Any, obj: Geometry) -> None:

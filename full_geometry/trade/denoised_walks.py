@@ -8,7 +8,7 @@ to B, see `scenes.reference`. Each half has precomputed light of its own with no
 Their difference 2 s W tells s where W is known, from plain walks by both lights. Over the samples n of a pixel e²
 falls as c n^-a. Parts of more and more samples tell c and a by least squares with the covariance of blocks of pixels:
 what the noise of A' adds to all parts alike is not taken for error. The light of a half is for m samples, and an image
-of n samples has that of as many. A render mixes denoised halves with what was denoised (`Halves.mixed`), whose noise is
+of n samples has that of as many. A render mixes denoised halves with what was denoised (`MixedHalves`), whose noise is
 V / n:
 
     e²(n) = c n^-a (V / n) / (c n^-a + V / n) + W m / n.

@@ -255,8 +255,13 @@ def calibrated(model: NeuralShape) -> NeuralShape:
     if not weights.any():
         return model
     proposals = EntryProposals(model.object, model.half_space)
-    B = _mean(lambda n, k: _walks(model.object, n, k), *WALKS)
-    S = _mean(lambda n, k: _pairs(model, proposals, n, k), *PAIRS)
+
+    def walks(n: int, k: int) -> np.ndarray:
+        starts = model.object.random_points(generator(mi, n, pass_seed(SEED, 0, k)))
+        return _rows(trace_exits(model.object, starts, (SEED, 1, k)).T)
+
+    B = _mean(walks, *WALKS)
+    S = _mean(lambda n, k: _values(model, *_drawn(model, proposals, n, k)), *PAIRS)
     known = (B > 0) & (S > 0)
     ratio = np.clip(np.where(known, B, 1) / np.where(known, S, 1), 1 / MOST_SCALE, MOST_SCALE)
     return replace(model, scales=tuple((np.array(model.scales or 1.0) * ratio**weights).tolist()))
@@ -316,24 +321,13 @@ def calibration_weight(mixture: Mixed) -> float:
 def _mean(sample: Callable[[int, int], np.ndarray], fewest: int, most: int) -> np.ndarray:
     """Mean of each channel of samples (channels, n), n doubled until it is known well enough."""
     samples, k = sample(fewest, 0), 0
-    while samples.shape[1] < most and (_relative_error(samples) > ENOUGH).any():
+    while True:
+        mean, n = samples.mean(axis=1), samples.shape[1]
+        error = samples.std(axis=1) / np.maximum(mean, 1e-30) / np.sqrt(n)
+        if n >= most or not (error > ENOUGH).any():
+            return mean
         k += 1
-        samples = np.concatenate([samples, sample(samples.shape[1], k)], axis=1)
-    return samples.mean(axis=1)
-
-
-def _relative_error(samples: np.ndarray) -> np.ndarray:
-    return samples.std(axis=1) / np.maximum(samples.mean(axis=1), 1e-30) / np.sqrt(samples.shape[1])
-
-
-def _walks(obj: TranslucentObject, n: int, k: int) -> np.ndarray:
-    starts = obj.random_points(generator(mi, n, pass_seed(SEED, 0, k)))
-    return _rows(trace_exits(obj, starts, (SEED, 1, k)).T)
-
-
-def _pairs(model: NeuralShape, proposals: EntryProposals, n: int, k: int) -> np.ndarray:
-    """S mu_i over the density of the entries of n random exits."""
-    return _values(model, *_drawn(model, proposals, n, k))
+        samples = np.concatenate([samples, sample(n, k)], axis=1)
 
 
 def _drawn(

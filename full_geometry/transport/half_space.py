@@ -114,16 +114,11 @@ def half_space_model(name: str, geometry: Geometry, media: Sequence[Medium], set
 
 def positions_of(models: list[BSSRDF], name: str, geometry: Geometry, settings: Settings) -> PositionSampler:
     """Entries of an object by the mean of models of a name, and over the area."""
-    table = radial_table(models, name, geometry)
+    if geometry.group is not None:  # distances are in the frame of the shape, of instances of a mean size
+        models = [bssrdf(name, model.medium.scaled(geometry.group.scale)) for model in models]
+    table = RadialTable(models, geometry.size)
     share = area_share(geometry, table.mean / geometry.size, settings.area_share)
     return PositionSampler(geometry, table, AreaPoints(geometry.shape), share)
-
-
-def radial_table(models: list[BSSRDF], name: str, geometry: Geometry) -> RadialTable:
-    """Distances between entries and exits, in the frame of the shape: of instances of a mean size."""
-    if geometry.group is not None:
-        models = [bssrdf(name, model.medium.scaled(geometry.group.scale)) for model in models]
-    return RadialTable(models, geometry.size)
 
 
 def area_share(geometry: Geometry, ratio: float, wanted: float) -> float:
