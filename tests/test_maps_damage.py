@@ -18,15 +18,15 @@ HOW = {"grid": MapGrid(2, 16, 4, 4), "target_error": None, "n_paths": 1024}
 COORDINATES = ("theta_i", "mu_i", "phi_i", "mu_o", "delta_phi", "r_edges", "psi_edges", "mfp")
 
 
-@pytest.mark.parametrize(("at", "what"), [(4, "bytes"), (8, "bytes of a block"), (12, "compressed bytes")])
-def test_a_chunk_whose_head_tells_other_sizes_is_refused_by_name(at: int, what: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("at", [4, 8, 12])
+def test_a_chunk_with_other_bytes_is_refused_with_the_name_of_the_store(at: int, tmp_path: Path) -> None:
     path = make_maps(MEDIA, tmp_path, **HOW)["m"]
     load_maps(path)
     chunk = path / "mu_o" / "0.0"
     data = bytearray(chunk.read_bytes())
     data[at : at + 4] = b"\x08\x01\xf6\x31"
-    chunk.write_bytes(data[:183] if at == 12 else data)
-    with pytest.raises(ValueError, match=r"m.zarr is damaged or not a map store: chunk mu_o/0.0 must be of 256 bytes"):
+    chunk.write_bytes(data)
+    with pytest.raises(ValueError, match=r"m.zarr is damaged or not a map store"):
         load_maps(path)
 
 

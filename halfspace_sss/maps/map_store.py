@@ -1,19 +1,16 @@
 """Training maps of half-spaces: made in units that can be killed, resumed and spread; stored as labelled Zarr.
 
-Units, coordinates and attributes have checksums; chunks are checked by the sizes in their heads before Blosc, which
-trusts them, reads them.
+Units, coordinates and attributes have checksums, and so have the chunks of Zstandard that hold them.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
-import math
 import os
 import shutil
-import struct
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import asdict
 from pathlib import Path
@@ -63,47 +60,6 @@ def check_written(dataset: xr.Dataset) -> None:
 
 def _coordinates(dataset: xr.Dataset) -> dict[str, int]:
     return {str(name): zlib.crc32(np.asarray(c.values, "<f8").tobytes()) for name, c in dataset.coords.items()}
-
-
-HEAD = struct.Struct("<4B3I")  # versions, flags, size of a number; bytes, bytes of a block, compressed bytes
-
-
-def _chunks(path: Path) -> Iterator[tuple[Path, JsonDict]]:
-    """The chunks of a Zarr store that Blosc compressed, and what the store says of their arrays."""
-    for array in sorted(path.glob("*/.zarray")):
-        about = json.loads(array.read_text(encoding="utf-8"))
-        if (about.get("compressor") or {}).get("id") == "blosc":
-            yield from ((chunk, about) for chunk in array.parent.iterdir() if not chunk.name.startswith("."))
-
-
-def check_chunks(path: Path) -> None:
-    """ValueError if a chunk of a Zarr store that Blosc compressed has not the sizes that its head tells."""
-    for chunk, about in _chunks(path):
-        size, (told, length) = math.prod(about["chunks"]) * np.dtype(about["dtype"]).itemsize, _told(chunk)
-        if told[0] != size or not 0 < told[1] <= size or told[2] != length:
-            place = f"{chunk.parent.name}/{chunk.name}"
-            raise ValueError(f"chunk {place} must be of {size} bytes, {length} compressed, got {told}")
-
-
-def drop_cut_off(path: Path, units: set[tuple[int, int]]) -> None:
-    """Remove chunks of units, by (channel, direction), shorter than their heads tell: they then are missing."""
-    for chunk, about in _chunks(path):
-        place = chunk.name.split(".")[:2]
-        if (
-            about["chunks"][:2] == [1, 1]
-            and all(part.isdecimal() for part in place)
-            and tuple(map(int, place)) in units
-        ):
-            told, length = _told(chunk)
-            if length < max(told[2], HEAD.size):
-                chunk.unlink()
-
-
-def _told(chunk: Path) -> tuple[tuple[int, int, int], int]:
-    """What the head of a chunk tells, 0 if there is none, and the length of the file."""
-    with chunk.open("rb") as file:
-        head = file.read(HEAD.size)
-    return HEAD.unpack(head)[4:] if len(head) == HEAD.size else (0, 0, 0), chunk.stat().st_size
 
 
 FORMAT = 1
@@ -158,19 +114,17 @@ def make_maps(
     with contextlib.ExitStack() as locks:
         for path in paths.values():
             locks.enter_context(one_writer(path))
-        _create_missing(media, paths, asked, units, grid, seed)
+        _create_missing(media, paths, asked, grid, seed)
         _trace_missing(paths, asked, units, progress, executor)
     return paths
 
 
 def _create_missing(
-    media: Mapping[str, Medium], paths: dict[str, Path], asked: dict[str, dict], units: list[Unit], grid: MapGrid,
-    seed: int,
-) -> None:  # fmt: skip
+    media: Mapping[str, Medium], paths: dict[str, Path], asked: dict[str, dict], grid: MapGrid, seed: int
+) -> None:
     """Make the stores that are not there, once those that are there are known to be of the same parameters."""
     for name in media:
         if _exists(paths[name]):
-            drop_cut_off(paths[name], {(channel, u.theta_index) for of, channel, u in units if of == name})
             _open_same(paths[name], asked[name])
     for name, medium in media.items():
         if not _exists(paths[name]):
@@ -183,7 +137,7 @@ def _trace_missing(
 ) -> None:  # fmt: skip
     """Trace the units that are not whole."""
     stores = {name: _open_same(path, asked[name]) for name, path in paths.items()}
-    left = [u for u in units if not _done(paths[u[0]], stores[u[0]], u[1], u[2].theta_index)]
+    left = [u for u in units if not _done(stores[u[0]], u[1], u[2].theta_index)]
     before = len(units) - len(left)
     if progress:
         progress(before, len(units), "")
@@ -273,12 +227,18 @@ def _template(medium: Medium, grid: MapGrid, seed: int) -> xr.Dataset:
 def _create(path: Path, medium: Medium, grid: MapGrid, seed: int, asked: JsonDict) -> None:
     """A store of the right shape, made under another name and renamed; in an object store, with its metadata last.
     Encoded in memory: zarr's threads, which an interrupt does not end, would write on into a folder just removed."""
+    import zarr
+    from numcodecs import Zstd
+
     dataset, memory = _template(medium, grid, seed), {}
     dataset.attrs |= {ASKED: json.dumps(asked, sort_keys=True), "provenance": json.dumps(provenance())}
     dataset.attrs |= written_checksums(dataset)
-    chunks = {name: {"chunks": (1, 1, *dataset[name].shape[2:])} for name in dataset.data_vars}
-    dataset.to_zarr(memory, mode="w", zarr_format=2, encoding=chunks)
-    # bytes in version 2 of zarr, the last one for Python 3.10
+    key = "compressor" if zarr.__version__ < "3" else "compressors"  # version 2 is the last one for Python 3.10
+    kinds = {name: {key: Zstd(checksum=True)} for name in dataset.variables}
+    for name in dataset.data_vars:
+        kinds[name]["chunks"] = (1, 1, *dataset[name].shape[2:])
+    dataset.to_zarr(memory, mode="w", zarr_format=2, encoding=kinds)
+    # bytes in version 2 of zarr
     content = {key: data if isinstance(data, bytes) else data.to_bytes() for key, data in memory.items()}
     if is_remote(path):
         for key in sorted(content, key=METADATA.__eq__):
@@ -309,7 +269,6 @@ def _open(path: Path) -> xr.Dataset:
     import xarray as xr
 
     try:
-        check_chunks(path)
         dataset = xr.open_zarr(**_at(path), chunks=None)
         asked = json.loads(dataset.attrs[ASKED])
         missing = {*DATA, "checksum", "n_paths", "n_events"} - set(dataset.data_vars)
@@ -335,14 +294,14 @@ def _open_same(path: Path, asked: JsonDict) -> xr.Dataset:
     return dataset
 
 
-def _done(path: Path, dataset: xr.Dataset, channel: int, theta: int) -> bool:
-    """Whether a unit is whole; one whose data do not fit its checksum was cut off and is made again."""
+def _done(dataset: xr.Dataset, channel: int, theta: int) -> bool:
+    """Whether a unit is whole; one that cannot be read, or does not fit its checksum, was cut off and is made again."""
     at = {"channel": channel, "theta": theta}
     try:
         stored = int(dataset["checksum"].isel(at).values)
         return stored != 0 and stored == unit_checksum(*(dataset[name].isel(at).values for name in DATA))
-    except Exception as error:
-        raise ValueError(f"map store {path} is damaged in channel {channel}, theta {theta}: {error}") from error
+    except Exception:  # zarr and its codecs each raise their own kinds
+        return False
 
 
 def _trace_and_write(path: Path, channel: int, unit: MapUnit) -> None:
