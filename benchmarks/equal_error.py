@@ -36,7 +36,8 @@ from figures.computing.learnt import (
 from figures.computing.scans import BUNNY, MATERIALS, SCANS, prepare
 from figures.computing.timed import TimedRender, alternating, rendered
 from figures.fig01 import VIEWS
-from figures.modelling.objects import TISSUES, VARYING, tissue
+from figures.modelling.objects import MODELS as VARYING
+from figures.modelling.objects import TISSUES, tissue
 from figures.parts.part import Params, Part, Result, SceneDict, Task
 from full_geometry.trade.denoising import cover
 from halfspace_sss import materials
@@ -59,7 +60,7 @@ def modelled_scene(
     """A modelled object on its own, as a dict for `scene_files.load_scene`, under its name.
 
     Args:
-        name: a name in `modelling.objects.OBJECTS`.
+        name: a name in `modelling.objects.MODELS`, or "candle".
         resolution, seed: of its surface.
         size: pixels of the square image.
         lights: "even sky", radiance 1 from everywhere, or "small light": of the candle its flame, else a lamp.
@@ -263,7 +264,7 @@ def errors(timed: TimedRender, truth: Result, mask: np.ndarray, is_exact: bool) 
     bias2 = np.zeros_like(error) if is_exact else error - spread
     return {
         "spp": timed.spp // count,
-        "seconds": timed.typical_cpu_seconds,
+        "seconds": float(np.median(timed.pass_cpu_seconds)),
         "variance": float(np.mean(error if is_exact else spread)),
         "bias2": float(np.mean(bias2)),
         "bias2 standard error": _standard_error(bias2),

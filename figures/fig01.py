@@ -58,7 +58,6 @@ class View(NamedTuple):
 VIEWS = {
     "candle": View((25, 125, 140), (0, 31.5, 0), 29, "sunset", 0.25, 0),
     "mandarin": View((18, 100, 150), (1, 14, 14), 33, "studio", 0.3, 0),
-    "meat": View((10, 120, 110), (-1, 7, 2), 34, "studio", 0.3, 0),
     "croissant": View((30, 110, 170), (-4, 11, 21), 35, "studio", 0.3, -75),
 }
 

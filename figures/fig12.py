@@ -11,7 +11,7 @@ import numpy as np
 
 from figures.computing.contenders import reference_image
 from figures.computing.images import FLIP, Shot, compared, stops_of
-from figures.computing.learnt import shape_of
+from figures.computing.learnt import bunny_of_potato
 from figures.computing.scans import BUNNY, prepare, scan_scene
 from figures.drawing.image_grid import image_files
 from figures.parts.part import Params, Part, Result, Task
@@ -77,7 +77,7 @@ def _weights(task: Task) -> dict[str, Path]:
     from halfspace_sss.neural.store import load_weights, save_weights
 
     p, folders = task.params, {name: task.folder / name for name in SAMPLERS}
-    obj = object_of(*shape_of("bunny", task.folder))
+    obj = object_of(*bunny_of_potato())
     path = train_unattended(obj, folders["patches"], cpu_seconds=p["seconds"], seed=p["seed"]).path
     arrays, record = load_weights(path, KIND)
     of_patches = {CENTRES} | {name for name in arrays if name.startswith(("V_", "c_"))}

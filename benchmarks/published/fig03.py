@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from figures.computing.learnt import SHAPES, object_parts
+from figures.computing.learnt import object_parts
 from figures.computing.scans import BUNNY, prepare, scan_scene
 from figures.parts.part import Params, Part, Result, Task
 from halfspace_sss.comparison.style import TEXT, paper, saved
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from full_geometry.transport.features import ObjectFrame
     from full_geometry.transport.storing import Learnt
 
+SHAPES = ("bunny", "candle")
 TITLE = "points of entry drawn by the paper's flow, without and with light, and by patches"
 SECONDS = {"draft": 6, "paper": 60}  # CPU time of the object, and of each flow
 POINTS = {"draft": 512, "paper": 2048}

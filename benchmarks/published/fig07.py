@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.published import meat  # noqa: F401  # an object more
 from figures.computing.contenders import NOTE, against, reference_shot
 from figures.computing.images import Shot
 from figures.computing.learnt import (

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from figures.computing.learnt import shape_of
+from figures.computing.learnt import bunny_of_potato
 from figures.computing.scans import BUNNY, prepare
 from figures.parts.part import Params, Part, Result, Task
 from halfspace_sss.comparison.style import COLUMN, paper, saved
@@ -74,7 +74,7 @@ def ours(task: Task) -> dict[str, object]:
 
     prepare()
     p = task.params
-    obj = object_of(*shape_of("bunny", task.folder))
+    obj = object_of(*bunny_of_potato())
     learnt = train_unattended(obj, task.folder, cpu_seconds=p["seconds"], seed=p["seed"])
     truth = truth_of(obj, p)
     proposals = EntryProposals(obj, HalfSpace(obj, BACKBONE)).with_patches(learnt.sampler)
@@ -90,7 +90,7 @@ def papers(task: Task) -> dict[str, object]:
 
     prepare()
     p, repeats = task.params, 8
-    obj = object_of(*shape_of("bunny", task.folder))
+    obj = object_of(*bunny_of_potato())
     truth = truth_of(obj, p)
     net, steps = fit_paper(obj, PaperRecipe(n=p["n"], seconds=p["seconds"]), p["seed"])
     rows = []

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from figures.computing.scans import BUNNY, MM_PER_UNIT, SCANS, prepare, scan_scene
-from figures.modelling.objects import candle_parts, learnable_parts, make_candle, make_varying, tissue
+from figures.modelling.objects import candle_parts, learnable_parts, make_varying
 from figures.parts.part import Part, Result, SceneDict, Task
 from halfspace_sss import materials
 from halfspace_sss.neural.network import channels
@@ -22,18 +22,12 @@ from halfspace_sss.registry import models_of
 if TYPE_CHECKING:
     import mitsuba as mi
 
-SHAPES, CANDLE_RESOLUTION = ("bunny", "candle"), 96
 
-
-def shape_of(name: str, folder: Path) -> tuple[mi.Shape, Medium, float]:
-    """A Mitsuba shape, its medium and millimetres of a unit: the bunny of potato, or the candle of wax.
-    `name`: "bunny" or "candle". `folder`: where the mesh of the candle is written."""
+def bunny_of_potato() -> tuple[mi.Shape, Medium, float]:
+    """A Mitsuba shape, its medium and millimetres of a unit."""
     import mitsuba as mi
 
-    if name == "bunny":
-        return mi.load_dict({"type": "ply", "filename": str(BUNNY)}), materials.load("potato").medium, MM_PER_UNIT
-    path = make_candle(CANDLE_RESOLUTION).wax.write_ply(folder / "wax.ply")
-    return mi.load_dict({"type": "ply", "filename": str(path)}), tissue("candle wax").medium, 1.0
+    return mi.load_dict({"type": "ply", "filename": str(BUNNY)}), materials.load("potato").medium, MM_PER_UNIT
 
 
 FULL_GEOMETRY = "full_geometry"
@@ -72,7 +66,7 @@ def train_scan(name: str, material: str, chunks: int, scan: str = "bunny") -> Pa
 
 def train_modelled(name: str, resolution: int, chunks: int) -> Part:
     """The part in which a modelled object is learnt.
-    `name`: a name in `modelling.objects.OBJECTS`. `resolution`: of its surface. `chunks`: as in `train_scan`."""
+    `name`: "candle", or in `modelling.objects.MODELS`. `resolution`: of its surface. `chunks`: as in `train_scan`."""
     params = {"object": name, "resolution": resolution, "chunks": chunks, "seed": 0, "model": FULL_GEOMETRY}
     return Part(training_of(name), _modelled, params, chunks)
 

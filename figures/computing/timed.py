@@ -44,11 +44,6 @@ class TimedRender:
         """Of all passes."""
         return float(sum(self.pass_seconds))
 
-    @property
-    def typical_cpu_seconds(self) -> float:
-        """Of a pass: the median."""
-        return float(np.median(self.pass_cpu_seconds))
-
 
 def gathered_anew(scene: mi.Scene) -> float:
     """Gather the light of a scene by `bssrdf` as if it never had been; the CPU seconds that takes."""

@@ -212,14 +212,10 @@ def _coefficients(shares: Mapping[str, np.ndarray]) -> np.ndarray:
     return np.stack(list(shares.values()), axis=1) @ np.array(columns)
 
 
-VARYING = ("mandarin", "meat", "croissant")
-OBJECTS = ("candle", *VARYING)
 FLAME_RADIANCE = (60.0, 30.0, 8.5)
-ETA = {"mandarin": 1.36, "meat": 1.4, "croissant": 1.3}
-_MODELS = {
-    "mandarin": (varying.Mandarin, varying.MANDARIN_BOX),
-    "meat": (varying.Meat, varying.MEAT_BOX),
-    "croissant": (varying.Croissant, varying.CROISSANT_BOX),
+MODELS: dict[str, tuple[Callable, Box, float]] = {  # of varying objects, of a seed; box; relative index
+    "mandarin": (varying.Mandarin, varying.MANDARIN_BOX, 1.36),
+    "croissant": (varying.Croissant, varying.CROISSANT_BOX, 1.3),
 }
 
 
@@ -235,14 +231,14 @@ class Varying:
 
 def make_varying(name: str, resolution: int = 192, grid_resolution: int = 160, seed: int = 0) -> Varying:
     """An object whose medium varies.
-    `name`: "mandarin", "meat" or "croissant". `resolution`: grid cubes of the surface along the longest side of its
+    `name`: in `MODELS`. `resolution`: grid cubes of the surface along the longest side of its
     box, >= 8. `grid_resolution`: cells of the medium along that side, >= 8. `seed`: of everything uneven about it.
     ValueError if there is no such object, or a resolution is too small."""
-    check_choice("object", name, VARYING)
-    make, box = _MODELS[name]
+    check_choice("object", name, MODELS)
+    make, box, eta = MODELS[name]
     result = make(seed)
     mesh, grid = surface(result.distance, box, resolution), mixed(result.tissues, box, grid_resolution)
-    return Varying(name, mesh, grid, ETA[name])
+    return Varying(name, mesh, grid, eta)
 
 
 def candle_parts(folder: Path, resolution: int = 192, seed: int = 0) -> SceneDict:

@@ -14,7 +14,6 @@ pytest.importorskip("matplotlib")
 
 from benchmarks.published import fig03, fig08  # noqa: E402
 from figures import fig12  # noqa: E402
-from figures.computing.learnt import SHAPES  # noqa: E402
 from figures.parts.part import Result, keys_of  # noqa: E402
 from halfspace_sss.neural.store import weights_folder, weights_in  # noqa: E402
 
@@ -39,7 +38,7 @@ def test_points_of_both_objects_are_drawn_with_their_distances() -> None:
         "rmsd": dict.fromkeys(kinds, 0.01), "light": dict.fromkeys(kinds, 2.0),
         "mesh": rng.random((20, 3)).tolist(), "E": [0.5] * 20, "exit": [0.5, 0.5, 0.5], "seconds": 1,
     }  # fmt: skip
-    files = fig03.draw({name: result(**numbers) for name in SHAPES})
+    files = fig03.draw({name: result(**numbers) for name in fig03.SHAPES})
     assert files["fig03.png"].startswith(b"\x89PNG")
     assert len(pandas.read_csv(io.StringIO(files["fig03.csv"]))) == 2 * len(kinds)
 
