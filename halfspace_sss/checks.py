@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 import numbers
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -95,17 +95,22 @@ def check_cosine(name: str, value: object, low: float = 0.0) -> float:
     return float(value)
 
 
-def check_query(lib: Library, args: tuple[Real, ...], given: tuple[Real, ...]) -> tuple[Real, ...]:
+QUERY = ("r", "mu_i", "phi_i", "mu_o", "phi_o")
+RANGES = {"r": (0.0, math.inf), "mu_i": (0.0, 1.0), "mu_o": (0.0, 1.0)}  # azimuths are finite
+
+
+def check_query(
+    lib: Library, args: tuple[Real, ...], given: tuple[Real, ...], names: Sequence[str] = QUERY
+) -> tuple[Real, ...]:
     """Arguments of a query in their ranges, cosines that exceed 1 by rounding as 1; also refuses NaN.
     `args`: the arguments in one library and precision. `given`: the same as they came, whose precision says what is
-    rounding."""
+    rounding. `names`: of these."""
     if type(args[0]).__module__.startswith(("drjit", "mitsuba")):
         return args
-    bounds = {"r": (0.0, math.inf), "mu_i": (0.0, 1.0), "phi_i": None, "mu_o": (0.0, 1.0), "phi_o": None}
     checked = []
-    for (name, bound), value, raw in zip(bounds.items(), args, given):
+    for name, value, raw in zip(names, args, given):
         checked.append(value)
-        low, high = (-math.inf, math.inf) if bound is None else bound
+        low, high = RANGES.get(name, (-math.inf, math.inf))
         if 0 in value.shape:
             continue
         plain = value.detach() if hasattr(value, "detach") else value
@@ -116,7 +121,7 @@ def check_query(lib: Library, args: tuple[Real, ...], given: tuple[Real, ...]) -
         if high == 1 < largest <= 1 + rounding(raw):
             checked[-1], largest = lib.minimum(value, 1.0), 1.0
         if not (smallest >= low and largest <= high and math.isfinite(smallest) and math.isfinite(largest)):
-            what = "finite" if bound is None else f"finite and in [{low:g}, {high:g}]"
+            what = f"finite and in [{low:g}, {high:g}]" if name in RANGES else "finite"
             wrong = smallest if not smallest >= low else largest
             raise ValueError(f"{name} must be {what}, got {wrong!r}")
     return tuple(checked)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 import numpy as np
 
 from halfspace_sss.arrays import Library, Real, asks_nothing, broadcast_query, is_torch, labelled
-from halfspace_sss.checks import check_query
+from halfspace_sss.checks import QUERY, check_query
 from halfspace_sss.interface.query import Query
 from halfspace_sss.physics.fresnel import C_phi, F_t
 from halfspace_sss.physics.medium import Medium
@@ -113,7 +113,7 @@ class BSSRDF(abc.ABC):
         return labelled(functools.partial(self._S_of_arrays, G_of), query, "S", self.medium.n_channels is not None)
 
     def _S_of_arrays(self, G_of: Callable[[Query], Real], *query: Real) -> Real:
-        lib, args = broadcast_query(*query, names=("r", "mu_i", "phi_i", "mu_o", "phi_o"))
+        lib, args = broadcast_query(*query, names=QUERY)
         if asks_nothing(lib, args):
             return type(args[0])()
         args = check_query(lib, args, query)
@@ -143,13 +143,19 @@ class BSSRDF(abc.ABC):
         positional, named = self._options
         return type(self)(medium, *positional, **named)
 
-    def _per_channel(self, lib: Library, x: Real, answer: Callable[[RadialSampler, float], Real]) -> Real:
-        """`answer(sampler, sigma_t)` for each channel, stacked last."""
+    def _per_channel(
+        self, lib: Library, x: Real, answer: Callable[[RadialSampler, float, Real], Real], has_axis: bool = False
+    ) -> Real:
+        """`answer(sampler, sigma_t, x)` for each channel, stacked last; x may have the axis of channels already."""
         if self.medium.n_channels is None:
-            return answer(self._radial_samplers[0], self.medium.sigma_t)
+            return answer(self._radial_samplers[0], self.medium.sigma_t, x)
         lib.constant(self.medium.sigma_t, x)
-        parts = [answer(s, float(t)) for s, t in zip(self._radial_samplers, self.medium.sigma_t)]
-        return lib.stack(parts)
+        pairs = enumerate(zip(self._radial_samplers, self.medium.sigma_t))
+        return lib.stack([answer(s, float(t), x[..., k] if has_axis else x) for k, (s, t) in pairs])
+
+    def _pdf_of(self, lib: Library, r: Real, has_axis: bool = False) -> Real:
+        """Density of `sample_position` at distances, 1/mm²."""
+        return self._per_channel(lib, r, lambda sampler, t, r: t**2 * sampler.pdf(lib, t * r), has_axis)
 
     def sample_position(self, mu_o: Real, u: Real | Sequence[Real]) -> PositionSample:
         """Sample where light enters for an exit direction, from the model's own radial profile.
@@ -166,28 +172,17 @@ class BSSRDF(abc.ABC):
         lib, (u_1, u_2, mu_o) = broadcast_query(u_1, u_2, mu_o)
         if asks_nothing(lib, (u_1, u_2, mu_o)):
             return PositionSample(*(type(u_1)() for _ in PositionSample._fields))
-        r = self._per_channel(lib, u_1, lambda sampler, sigma_t: sampler.sample(lib, u_1) / sigma_t)
+        r = self._per_channel(lib, u_1, lambda sampler, sigma_t, u: sampler.sample(lib, u) / sigma_t)
         phi = 2 * math.pi * u_2
-        pdf = self._pdf_own_channel(lib, r)
+        pdf = self._pdf_of(lib, r, has_axis=True)
         return PositionSample(r, phi[..., None] + 0 * r if self.medium.n_channels else phi, pdf)
-
-    def _pdf_own_channel(self, lib: Library, r: Real) -> Real:
-        """Density of `sample_position` for r that already carries the channel axis, 1/mm²."""
-        if self.medium.n_channels is None:
-            sigma_t = self.medium.sigma_t
-            return sigma_t**2 * self._radial_samplers[0].pdf(lib, sigma_t * r)
-        parts = [
-            float(t) ** 2 * s.pdf(lib, float(t) * r[..., k])
-            for k, (s, t) in enumerate(zip(self._radial_samplers, self.medium.sigma_t))
-        ]
-        return lib.stack(parts)
 
     def pdf_position(self, r: Real, phi: Real, mu_o: Real) -> Real:
         """Density of `sample_position` in 1/mm² at distance r (mm) and azimuth phi; arguments broadcast."""
         lib, (r, phi, mu_o) = broadcast_query(r, phi, mu_o)
         if asks_nothing(lib, (r, phi, mu_o)):
             return type(r)()
-        return self._per_channel(lib, r, lambda sampler, sigma_t: sigma_t**2 * sampler.pdf(lib, sigma_t * r))
+        return self._pdf_of(lib, r)
 
     def sample_direction(self, r: Real, mu_o: Real, phi_o: Real, u: Real | Sequence[Real]) -> DirectionSample:
         """Sample where light comes from, given the position: by the cosine over the directions that refract.

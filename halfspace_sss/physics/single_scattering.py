@@ -17,35 +17,22 @@ from collections.abc import Sequence
 import numpy as np
 
 from halfspace_sss.arrays import Library, Real, broadcast_query, library
-from halfspace_sss.checks import rounding
+from halfspace_sss.checks import check_query
 from halfspace_sss.physics.fresnel import F_t, mu_external, mu_internal, sine
 from halfspace_sss.physics.medium import Medium, eval_hg
 
 TINY = 1e-30
-_RANGES = dict.fromkeys(("phi", "delta_phi"), (-math.inf, math.inf)) | {"r": (0.0, math.inf)}
 _NUMPY = library(0.0)
 
 
 def _arguments(medium: Medium, **args: Real) -> tuple[Library, Sequence[Real]]:
     """Broadcast arguments in one library, with a channel axis last if the medium has channels; refuses bad ranges."""
     lib, values = broadcast_query(*args.values())
-    values = tuple(_checked(lib, name, value, given) for (name, given), value in zip(args.items(), values))
+    values = check_query(lib, values, tuple(args.values()), tuple(args))
     if medium.n_channels is not None:
         lib.constant(medium.sigma_t, values[0])
         values = [v[..., None] for v in values]
     return lib, values
-
-
-def _checked(lib: Library, name: str, value: Real, given: Real) -> Real:
-    """Cosines in [0, 1] up to rounding of what was given, distances >= 0, angles finite; Dr.Jit lanes as they are."""
-    if type(value).__module__.startswith(("drjit", "mitsuba")) or 0 in value.shape:
-        return value
-    low, high = _RANGES.get(name, (0.0, 1.0))
-    value = lib.minimum(value, 1.0) if high == 1 < float(value.max()) <= 1 + rounding(given) else value
-    for v in (float(value.min()), float(value.max())):
-        if not (low <= v <= high and math.isfinite(v)):
-            raise ValueError(f"{name} must be finite and in [{low:g}, {high:g}], got {v!r}")
-    return value
 
 
 def _sine(lib: Library, mu: Real, eta: float) -> Real:
@@ -137,7 +124,7 @@ def _cosines(medium: Medium, mu_i: Real) -> tuple[np.ndarray, np.ndarray | None]
             raise ValueError(f'mu_i must be cosines in [0, 1] or "diffuse", got {mu_i!r}')
         x, _, w = _graded(12, 12, 10)
         return mu_external(x, min(medium.eta, 1.0)), 2 * min(medium.eta, 1.0) ** 2 * x * w
-    return _checked(library(0.0), "mu_i", np.asarray(mu_i, dtype=np.float64), mu_i), None
+    return check_query(_NUMPY, (np.asarray(mu_i, dtype=np.float64),), (mu_i,), ("mu_i",))[0], None
 
 
 def reflectance(medium: Medium, mu_i: Real = 1.0) -> Real:

@@ -209,9 +209,9 @@ def test_exitance_agrees_in_torch_and_keeps_the_precision_of_the_query():
     [
         (lambda m: single.brdf(m, 1.2, 0.5, 0.0), r"mu_i must be finite and in \[0, 1\], got 1.2"),
         (lambda m: single.brdf(m, 0.5, -0.1, 0.0), r"mu_o must be finite and in \[0, 1\], got -0.1"),
-        (lambda m: single.brdf(m, 0.5, 0.5, math.nan), "delta_phi must be finite .*nan"),
+        (lambda m: single.brdf(m, 0.5, 0.5, math.nan), "delta_phi must be finite, got nan"),
         (lambda m: single.exitance(m, -1.0), r"r must be finite and in \[0, inf\], got -1.0"),
-        (lambda m: single.exitance(m, 1.0, 0.5, math.inf), "phi must be finite .*inf"),
+        (lambda m: single.exitance(m, 1.0, 0.5, math.inf), "phi must be finite, got inf"),
         (lambda m: single.reflectance(m, [0.5, 2.0]), r"mu_i must be finite and in \[0, 1\], got 2.0"),
         (lambda m: single.reflectance(m, "sunny"), "mu_i must be cosines .*'sunny'"),
         (lambda m: single.moments(m, "diffuse"), "mu_i must be cosines .*'diffuse'"),
