@@ -8,7 +8,8 @@ import os
 import sys
 import time
 import warnings
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
@@ -155,10 +156,12 @@ def limit_threads(threads: int) -> None:
     dr.set_thread_count(threads)
 
 
-def one_blas_thread() -> AbstractContextManager[object]:
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
     """One thread of the BLAS: its sums then have one order, and small matrices are slower with more.
     On a machine that has other work they are so many times over."""
-    return _controller().limit(limits=1, user_api="blas")
+    with _controller().limit(limits=1, user_api="blas"):
+        yield
 
 
 @once

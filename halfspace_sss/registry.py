@@ -22,7 +22,13 @@ _registered: dict[str, type[BSSRDF]] = {}
 @once
 def _installed() -> Mapping[str, type[BSSRDF]]:
     """Models of this project, then those of all installed packages."""
-    return listed_models(BSSRDF)
+    results = _new_models([*ANALYTIC, *NEURAL], {})
+    for name, classes in offered(MODELS):
+        try:
+            results |= _new_models(classes, results)
+        except FAILURES as error:
+            warn_left_out(MODELS, name, error)
+    return results
 
 
 def register_model(cls: type[BSSRDF]) -> type[BSSRDF]:
@@ -34,16 +40,13 @@ def register_model(cls: type[BSSRDF]) -> type[BSSRDF]:
     Raises:
         ValueError: it is not a BSSRDF with name and orders, or the name is taken by another class.
     """
-    check_model_class(cls, BSSRDF)
-    if cls.name in models() and not _defined_again(cls):
+    _check_class(cls)
+    before = _registered.get(cls.name)
+    again = before and (before.__module__, before.__qualname__) == (cls.__module__, cls.__qualname__)
+    if cls.name in models() and not again:
         raise ValueError(f"model name must be new, got {cls.name!r}, which is registered already")
     _registered[cls.name] = cls
     return cls
-
-
-def _defined_again(cls: type[BSSRDF]) -> bool:
-    before = _registered.get(cls.name)
-    return before is not None and (before.__module__, before.__qualname__) == (cls.__module__, cls.__qualname__)
 
 
 def models() -> tuple[str, ...]:
@@ -81,10 +84,10 @@ def model_class(name: str) -> type[BSSRDF]:
     return known[name]
 
 
-def check_model_class(cls: object, base: type) -> None:
+def _check_class(cls: object) -> None:
     """ValueError if it is no class of a model, or has no usable name or orders."""
-    if not (isinstance(cls, type) and issubclass(cls, base)):
-        raise ValueError(f"a model must be a subclass of {base.__name__}, got {cls!r}")
+    if not (isinstance(cls, type) and issubclass(cls, BSSRDF)):
+        raise ValueError(f"a model must be a subclass of BSSRDF, got {cls!r}")
     name, orders = getattr(cls, "name", None), getattr(cls, "orders", None)
     if not isinstance(name, str) or not name:
         raise ValueError(f"name of a model must be a text that is not empty, got {name!r}")
@@ -92,21 +95,10 @@ def check_model_class(cls: object, base: type) -> None:
         raise ValueError(f"orders of a model must be multiple or total, got {orders!r}")
 
 
-def listed_models(base: type) -> dict[str, type]:
-    """The model classes of all lists by name: of `analytic_models`, of `neural`, of other packages."""
-    results: dict[str, type] = _new_models([*ANALYTIC, *NEURAL], base, {})
-    for name, classes in offered(MODELS):
-        try:
-            results |= _new_models(classes, base, results)
-        except FAILURES as error:
-            warn_left_out(MODELS, name, error)
-    return results
-
-
-def _new_models(classes: Iterable[type], base: type, known: Mapping[str, type]) -> dict[str, type]:
+def _new_models(classes: Iterable[type], known: Mapping[str, type]) -> dict[str, type]:
     new: dict[str, type] = {}
     for cls in classes:
-        check_model_class(cls, base)
+        _check_class(cls)
         if known.get(cls.name) is cls:  # from a list that is offered twice
             continue
         if cls.name in known or cls.name in new:

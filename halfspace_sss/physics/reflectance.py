@@ -60,6 +60,7 @@ class _Modes(NamedTuple):
     a_beta: np.ndarray
 
 
+@one_blas_thread()
 def half_space_reflectance(albedo: float, g: float, eta: float, mu_i: float | str = DIFFUSE) -> float:
     """The fraction of incident flux that comes back out of the medium, all orders, as R(mu_i) of the conventions.
 
@@ -73,11 +74,6 @@ def half_space_reflectance(albedo: float, g: float, eta: float, mu_i: float | st
     6e-5 for g in [-0.95, 0.98], and 6e-3 at -0.99, where the peak backwards leaves along the normal.
     """
     _check(g, mu_i)
-    with one_blas_thread():
-        return _reflectance(albedo, g, eta, mu_i)
-
-
-def _reflectance(albedo: float, g: float, eta: float, mu_i: float | str) -> float:
     m, basis, T, share = _even_light(albedo, g, eta)
     if mu_i == DIFFUSE:
         up = (m.s - m.d) / 2
@@ -123,6 +119,7 @@ class SlabFluxes(NamedTuple):
 LARGEST_SLAB_ALBEDO = 1 - 1e-9  # beyond it light that decays from both sides cannot be told apart
 
 
+@one_blas_thread()
 def slab_fluxes(
     albedo: float, g: float, tau: float, eta: float, eta_slide: float = 1.0, nodes: int = NODES
 ) -> SlabFluxes:
@@ -138,11 +135,7 @@ def slab_fluxes(
             incoherently.
         nodes: quadrature points.
     """
-    with one_blas_thread():
-        return _slab_fluxes(min(albedo, LARGEST_SLAB_ALBEDO), g, tau, eta, eta_slide, nodes)
-
-
-def _slab_fluxes(albedo: float, g: float, tau: float, eta: float, eta_slide: float, nodes: int) -> SlabFluxes:
+    albedo = min(albedo, LARGEST_SLAB_ALBEDO)
     m, basis = _modes(albedo, g, eta, nodes), _basis(eta, nodes)
     thick = tau * (1 - albedo * g**nodes)  # of delta-M
     F = _slide_reflectance(basis.mu, eta, eta_slide)
@@ -183,6 +176,7 @@ class SlabKernels(NamedTuple):
     straight: float  # optical thickness for light that passes unscattered; of delta-M
 
 
+@one_blas_thread()
 def slab_kernels(
     albedo: float, g: float, tau: float, eta: float, azimuths: np.ndarray, orders: int, nodes: int = NODES
 ) -> SlabKernels:
@@ -198,14 +192,7 @@ def slab_kernels(
         azimuths: between the directions of travel.
         orders: of the Fourier series over azimuth.
     """
-    with one_blas_thread():
-        return _slab_kernels(min(albedo, LARGEST_SLAB_ALBEDO), g, tau, eta, (azimuths, orders), nodes)
-
-
-def _slab_kernels(
-    albedo: float, g: float, tau: float, eta: float, series: tuple[np.ndarray, int], nodes: int
-) -> SlabKernels:
-    azimuths, orders = series
+    albedo = min(albedo, LARGEST_SLAB_ALBEDO)
     first, basis = _modes(albedo, g, eta, nodes), _basis(eta, nodes)
     t, mu = tau * (1 - albedo * g**nodes), basis.mu
     F = F_r(mu, 1 / eta)
@@ -275,15 +262,15 @@ def _slide_reflectance(mu: np.ndarray, eta: float, eta_slide: float) -> np.ndarr
     return np.where(turned, 1.0, inner + (1 - inner) ** 2 * outer / np.where(turned, 1.0, 1 - inner * outer))
 
 
+@one_blas_thread()
 def directional_table(g: float, eta: float, x: np.ndarray, mu_in: np.ndarray) -> np.ndarray:
     """ln(R(mu) / (albedo F_t(mu))), shape (x, mu_in), which is smooth in both.
     `g`, `eta`: as in `half_space_reflectance`. `x`: in [0, 1], of the albedos 1 - albedo' = s², s = x / (c + (1 - c)
     x), c = (1 - max(g, 0))^(1/3). `mu_in`: cosines inside, in [0, 1], of the directions mu outside."""
     result = []
-    with one_blas_thread():
-        for albedo in np.maximum(_albedo(np.asarray(x, dtype=float), g)[0], LEAST).tolist():
-            m, basis, _, share = _even_light(albedo, g, eta)
-            result.append([_upwards(m, basis, share, each) / (albedo * eta**2) for each in mu_in])
+    for albedo in np.maximum(_albedo(np.asarray(x, dtype=float), g)[0], LEAST).tolist():
+        m, basis, _, share = _even_light(albedo, g, eta)
+        result.append([_upwards(m, basis, share, each) / (albedo * eta**2) for each in mu_in])
     return np.log(result)
 
 
@@ -373,10 +360,9 @@ def _inverse(g: float, eta: float, mu_i: float | str) -> tuple[np.ndarray, np.nd
 
     def log_ratio(x: np.ndarray) -> np.ndarray:
         albedo = _albedo(x, g)[0]
-        return np.log([_reflectance(a, g, eta, mu_i) / a for a in albedo])
+        return np.log([half_space_reflectance(a, g, eta, mu_i) / a for a in albedo])
 
-    with one_blas_thread():
-        polynomial = np.polynomial.Chebyshev.interpolate(log_ratio, DEGREE, domain=[0, 1])
+    polynomial = np.polynomial.Chebyshev.interpolate(log_ratio, DEGREE, domain=[0, 1])
     x = np.linspace(1, 0, DENSE)
     return x, np.maximum.accumulate(_albedo(x, g)[0] * np.exp(polynomial(x))), polynomial
 
