@@ -99,12 +99,17 @@ def _shot(shot: Shot, exposure: float) -> JsonDict:
         plain = value if isinstance(value, str) else float(value)
         results["numbers"][column] = plain if isinstance(plain, str) or math.isfinite(plain) else str(plain)
     if shot.image is not None:
-        results["image"] = _image_address(np.round(255 * srgb(shot.image, exposure)).astype(np.uint8))
+        # FLIP between images as they were and as they are shown differs by less than 0.006
+        pixels = np.round(255 * srgb(shot.image, exposure)).astype(np.uint8)
+        results["image"] = _address(pixels, pixels, QUALITY)
     for kind, low in (("flip", 0.0), ("difference", -DIFFERENCE_SPAN)):
         values = getattr(shot, kind)
         if values is not None:
             scaled = np.clip((np.asarray(values) - low) / (DIFFERENCE_SPAN - low), 0.0, 1.0)
-            results[kind] = _map_address(scaled, _colors(MAPS[kind][1]))
+            # in the 256 colours, or without loss in few of them
+            few, colors = np.round((LEVELS - 1) * scaled) / (LEVELS - 1), _colors(MAPS[kind][1])
+            few, full = (colors[np.round(255 * v).astype(np.uint8)] for v in (few, scaled))
+            results[kind] = _address(few, full, MAP_QUALITY)
     return results
 
 
@@ -120,34 +125,18 @@ def _map(kind: str) -> JsonDict:
     return {"title": title, "colors": colors, "ends": ends}
 
 
-def _map_address(scaled: np.ndarray, colors: np.ndarray) -> str:
-    """A data address of a map (H, W) in [0, 1] in the 256 colours, or in few of them."""
-    few = np.round((LEVELS - 1) * scaled) / (LEVELS - 1)
-    full, few = (colors[np.round(255 * values).astype(np.uint8)] for values in (scaled, few))
-    return min(_exact(few), _lossy(full, MAP_QUALITY), key=len)
-
-
-def _image_address(pixels: np.ndarray) -> str:
-    """A data address of the pixels, (H, W, 3) bytes; FLIP between images as they were and as they are shown differs by
-    less than 0.006."""
-    return min(_exact(pixels), _lossy(pixels, QUALITY), key=len)
-
-
-def _exact(pixels: np.ndarray) -> str:
-    return _address(pixels, "webp", lossless=True)
-
-
-def _lossy(pixels: np.ndarray, quality: int) -> str:
-    """Without WebP, which has half of the resolution in colour, where noise is."""
-    return _address(pixels, "jpeg", quality=quality, subsampling=0, optimize=True)
-
-
-def _address(pixels: np.ndarray, kind: str, **settings: bool | int) -> str:
+def _address(exact: np.ndarray, pixels: np.ndarray, quality: int) -> str:
+    """A data address of pixels, (H, W, 3) bytes, without loss or as JPEG, whichever is smaller.
+    Without lossy WebP, which has half of the resolution in colour, where noise is."""
     from PIL import Image
 
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, kind, **settings)
-    return f"data:image/{kind};base64," + base64.b64encode(buffer.getvalue()).decode()
+    results = []
+    for data, kind, settings in (
+        (exact, "webp", {"lossless": True}), (pixels, "jpeg", {"quality": quality, "subsampling": 0, "optimize": True})
+    ):  # fmt: skip
+        Image.fromarray(data).save(buffer := io.BytesIO(), kind, **settings)
+        results.append(f"data:image/{kind};base64," + base64.b64encode(buffer.getvalue()).decode())
+    return min(results, key=len)
 
 
 def render(picture: Picture) -> dict[str, bytes]:

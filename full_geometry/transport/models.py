@@ -18,7 +18,7 @@ from full_geometry.settings import AUTO, PATH_TRACED, Capabilities
 from halfspace_sss.checks import check_choice
 from halfspace_sss.extensions import TRANSPORTS, offers
 from halfspace_sss.lazy import once
-from halfspace_sss.registry import model_class, models
+from halfspace_sss.registry import models
 
 if TYPE_CHECKING:
     from full_geometry.geometry.points import ObjectModel
@@ -57,13 +57,6 @@ class ModelEntry:
         if not callable(make):
             raise ValueError(f"model {self.name!r} must be made by a function, got {make!r}")
         return make
-
-    @property
-    def module(self) -> str:
-        """Dotted name of the module where it begins."""
-        if self.capabilities.of_half_space:
-            return model_class(self.name).__module__
-        return self.make.partition(":")[0] if isinstance(self.make, str) else self.make.__module__
 
 
 HALF_SPACE = Capabilities(

@@ -92,9 +92,13 @@ def _make_object(geometry: Geometry, spec: MediumSpec, settings: Settings) -> Tr
     if not corrected:  # by walks, which know any boundary
         check_boundary(geometry.name, obj.surface.boundary)
     obj.wrapping.check(geometry)
-    if geometry.inclusions is not None:
-        _check_takes(geometry, spec, single_only)
     capabilities = lookup(spec.model).capabilities
+    if geometry.inclusions is not None:
+        if single_only or not capabilities.inclusions:
+            refuse(geometry.inclusions.found[0], geometry, f"the model {spec.model!r}")
+        if spec.orders != "total":
+            told = f"got {spec.orders!r} of object {geometry.name}"
+            raise ValueError(f"orders must be 'total' of objects with something inside, {told}")
     derivatives = MediumDerivatives(obj.surface, settings.mm_per_unit, spec.model, capabilities.derivatives)
     if spec.orders == "total" and not (single_only or capabilities.straight or corrected):
         check_turns(geometry, media, spec.model)
@@ -110,16 +114,6 @@ def _make_object(geometry: Geometry, spec: MediumSpec, settings: Settings) -> Tr
         obj, transport=transport, proposals=proposals, entries=entries, low_orders=low_orders,
         expected=expected_of(media), derivatives=derivatives, capabilities=capabilities,
     )  # fmt: skip
-
-
-def _check_takes(geometry: Geometry, spec: MediumSpec, single_only: bool) -> None:
-    """ValueError if a model does not take what lies inside its object, or some orders only are asked for."""
-    if single_only or not lookup(spec.model).capabilities.inclusions:
-        refuse(geometry.inclusions.found[0], geometry, f"the model {spec.model!r}")
-    if spec.orders != "total":
-        raise ValueError(
-            f"orders must be 'total' of objects with something inside, got {spec.orders!r} of object {geometry.name}"
-        )
 
 
 def _low_orders(spec: MediumSpec, transport: Transport | None, corrected: bool) -> tuple[int, ...]:

@@ -19,6 +19,7 @@ from urllib.parse import parse_qs, urlsplit
 import numpy as np
 
 from full_geometry.settings import PATH_TRACED
+from full_geometry.surface.textured import linear_of_srgb
 from full_geometry.trade.image_differences import srgb
 from full_geometry.transport.models import model_names
 from full_geometry.viewing.edits import Camera, Edits, Way
@@ -317,8 +318,7 @@ def _encoded(R: np.ndarray) -> tuple[int, int, int]:
 
 
 def _decoded(colour: tuple[int, int, int]) -> tuple[float, ...]:
-    x = np.array(colour) / 255
-    return tuple(np.where(x > 0.04045, ((x + 0.055) / 1.055) ** 2.4, x / 12.92).tolist())
+    return tuple(linear_of_srgb(np.array(colour) / 255).tolist())
 
 
 # ---- Ports, and who may connect -------------------------------------------------------------------------------------

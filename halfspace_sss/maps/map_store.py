@@ -6,6 +6,7 @@ Units, coordinates and attributes have checksums, and so have the chunks of Zsta
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
 import shutil
@@ -102,7 +103,7 @@ def make_maps(
 
     Raises:
         ValueError: an argument is out of range, a store exists with other parameters, or another run writes it; nothing
-            has been written then. Or a unit of a store is damaged; nothing has been traced then.
+            has been written then.
     """
     grid = grid or MapGrid()
     n_paths = n_paths if n_paths is None else as_count("n_paths", n_paths, 1024)
@@ -114,45 +115,24 @@ def make_maps(
     with contextlib.ExitStack() as locks:
         for path in paths.values():
             locks.enter_context(one_writer(path))
-        _create_missing(media, paths, asked, grid, seed)
-        _trace_missing(paths, asked, units, progress, executor)
-    return paths
-
-
-def _create_missing(
-    media: Mapping[str, Medium], paths: dict[str, Path], asked: dict[str, dict], grid: MapGrid, seed: int
-) -> None:
-    """Make the stores that are not there, once those that are there are known to be of the same parameters."""
-    for name in media:
-        if _exists(paths[name]):
+        # make the stores that are not there, once those that are there are known to be of the same parameters
+        for name in filter(lambda name: _exists(paths[name]), media):
             _open_same(paths[name], asked[name])
-    for name, medium in media.items():
-        if not _exists(paths[name]):
-            _create(paths[name], medium, grid, seed, asked[name])
-
-
-def _trace_missing(
-    paths: dict[str, Path], asked: dict[str, dict], units: list[Unit], progress: ProgressText | None,
-    executor: Executor | None,
-) -> None:  # fmt: skip
-    """Trace the units that are not whole."""
-    stores = {name: _open_same(path, asked[name]) for name, path in paths.items()}
-    left = [u for u in units if not _done(stores[u[0]], u[1], u[2].theta_index)]
-    before = len(units) - len(left)
-    if progress:
-        progress(before, len(units), "")
-    parts = {
-        f"{name} channel {channel} direction {unit.theta_index + 1}/{unit.grid.n_theta}": (
-            path.absolute(),
-            channel,
-            unit,
-        )
-        for name, channel, unit in left
-        for path in (paths[name],)
-    }
-    for done, (text, _) in enumerate(completed(executor, _trace_and_write, parts), before + 1):
-        if progress:
-            progress(done, len(units), text)
+        for name, medium in media.items():
+            if not _exists(paths[name]):
+                _create(paths[name], medium, grid, seed, asked[name])
+        # trace the units that are not whole
+        stores = {name: _open_same(path, asked[name]) for name, path in paths.items()}
+        left = [u for u in units if not _done(stores[u[0]], u[1], u[2].theta_index)]
+        parts = {
+            f"{name} channel {k} direction {unit.theta_index + 1}/{grid.n_theta}": (paths[name].absolute(), k, unit)
+            for name, k, unit in left
+        }
+        before, steps = len(units) - len(left), completed(executor, _trace_and_write, parts)
+        for done, (text, _) in enumerate(itertools.chain([("", None)], steps), before):
+            if progress:
+                progress(done, len(units), text)
+    return paths
 
 
 def _units(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 from halfspace_sss.arrays import Library, Real
 from halfspace_sss.interface.model import BSSRDF
@@ -39,12 +38,6 @@ def query_inputs(q: Query, L: Real) -> list[Real]:
     return paper_inputs(lib, lib.minimum(q.r, U_MAX * L), -q.phi_i, w_i, w_o, L)
 
 
-def _load(file: Path, medium: Medium) -> tuple[Network, float]:
-    """Network and scale of a file of weights."""
-    scale = record_number(file, load_weights(file, KIND)[1], "scale", 0.0, 1e30)
-    return load_network(file, KIND, medium, N_INPUTS, RELU), scale
-
-
 class NeuralPaper(BSSRDF):
     """The paper's setting: S ~ MLP(x, y, w_i, w_o), 3 hidden layers of 256 with ReLU, from the squared error of S.
 
@@ -63,9 +56,11 @@ class NeuralPaper(BSSRDF):
 
     def __init__(self, medium: Medium, trained: Sequence[tuple[Network, float]] | None = None) -> None:
         super().__init__(medium)
-        self.trained: Sequence[tuple[Network, float]] = trained or [
-            _load(find_weights(KIND, m), m) for m in channels(medium)
-        ]
+        self.trained: list[tuple[Network, float]] = list(trained or ())
+        for m in () if trained else channels(medium):
+            file = find_weights(KIND, m)
+            scale = record_number(file, load_weights(file, KIND)[1], "scale", 0.0, 1e30)
+            self.trained.append((load_network(file, KIND, m, N_INPUTS, RELU), scale))
 
     @property
     def checksums(self) -> tuple[str, ...]:

@@ -192,6 +192,9 @@ def trace(
     Raises:
         ValueError: an argument is out of range; nothing has been traced then.
     """
+    if not isinstance(medium, Layers):
+        medium = medium_of(medium)
+        check_scalar_medium(medium)
     n_paths = as_count("n_paths", n_paths, 256)
     check_count("seed", seed, 0)
     if mu_i != "diffuse":
@@ -204,8 +207,6 @@ def trace(
             if value is not None:
                 raise ValueError(f"{name} must be left out for layers, got {value!r}")
         return trace_layers(medium, mu_i, n_paths, seed, edges, backend, relative_error, progress)
-    medium = medium_of(medium)
-    check_scalar_medium(medium)
     pairs = _checked_directions(directions, mu_i)
     if mu_i == "diffuse" and instrument is not None:
         raise ValueError(f"instrument must be None for diffuse light, which is no beam, got {instrument!r}")

@@ -131,11 +131,6 @@ class WalkConstants:
         """Those of some of the lanes."""
         return replace(self, **{name: at_lanes(getattr(self, name), lanes) for name in ("albedo", "g", "inverse_eta")})
 
-    def check_lanes(self, lanes: int) -> None:
-        """ValueError unless the constants are those of one medium or of as many lanes as are walked."""
-        if dr.width(self.albedo) not in (1, lanes):
-            raise ValueError(f"medium must have one value or {lanes} (one per lane), got {dr.width(self.albedo)}")
-
 
 def pass_seed(seed: int, *indices: int) -> tuple[int, int]:
     """State and stream of the generator of one pass; distinct indices give independent streams."""
@@ -288,7 +283,8 @@ def walk(
     Float, UInt32 = types.Float, types.UInt32
     lanes = dr.width(mu_in)
     constants = medium if isinstance(medium, WalkConstants) else WalkConstants.uniform(types, medium)
-    constants.check_lanes(lanes)
+    if dr.width(constants.albedo) not in (1, lanes):
+        raise ValueError(f"medium must have one value or {lanes} (one per lane), got {dr.width(constants.albedo)}")
     mu_in = dr.clip(mu_in, 1e-6, 1.0)
     sin_in = dr.sqrt(dr.maximum((1 - mu_in) * (1 + mu_in), 0.0))
     lane = dr.arange(UInt32, lanes)
