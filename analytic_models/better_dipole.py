@@ -6,8 +6,7 @@ import math
 
 from analytic_models._diffusion import DiffuseBoundary, Grosjean, safe_differences
 from halfspace_sss.arrays import Real
-from halfspace_sss.interface.model import Separable
-from halfspace_sss.interface.query import Query
+from halfspace_sss.interface.model import Query, Separable
 from halfspace_sss.physics.medium import Medium
 
 

@@ -6,8 +6,7 @@ import math
 
 from analytic_models._diffusion import DiffuseBoundary, safe_differences
 from halfspace_sss.arrays import Real, library
-from halfspace_sss.interface.model import BSSRDF
-from halfspace_sss.interface.query import Query
+from halfspace_sss.interface.model import BSSRDF, Query
 from halfspace_sss.physics.medium import Medium
 
 R_MIN = 1e-6  # mean free paths

@@ -9,8 +9,7 @@ import numpy as np
 
 from halfspace_sss.arrays import Library, Real, library
 from halfspace_sss.checks import check_choice
-from halfspace_sss.interface.model import BSSRDF
-from halfspace_sss.interface.query import Query
+from halfspace_sss.interface.model import BSSRDF, Query
 from halfspace_sss.physics.fresnel import boundary_A, sine
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.physics.reflectance import unit_gauss

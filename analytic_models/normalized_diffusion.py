@@ -8,8 +8,7 @@ import math
 import numpy as np
 
 from halfspace_sss.arrays import Real, library
-from halfspace_sss.interface.model import Separable, exit_normaliser
-from halfspace_sss.interface.query import Query
+from halfspace_sss.interface.model import Query, Separable, exit_normaliser
 from halfspace_sss.physics.fresnel import C_1
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.physics.reflectance import unit_gauss

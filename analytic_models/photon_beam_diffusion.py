@@ -7,8 +7,7 @@ import math
 from analytic_models._diffusion import DiffuseBoundary, Grosjean, safe_differences
 from halfspace_sss.arrays import Real
 from halfspace_sss.checks import check_choice
-from halfspace_sss.interface.model import BSSRDF
-from halfspace_sss.interface.query import Query
+from halfspace_sss.interface.model import BSSRDF, Query
 from halfspace_sss.physics.fresnel import sine
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.physics.reflectance import unit_gauss

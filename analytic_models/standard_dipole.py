@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 
 from halfspace_sss.arrays import Real, library
-from halfspace_sss.interface.model import Separable, exit_normaliser
-from halfspace_sss.interface.query import Query
+from halfspace_sss.interface.model import Query, Separable, exit_normaliser
 from halfspace_sss.physics.fresnel import boundary_A_jensen
 from halfspace_sss.physics.medium import Medium
 

@@ -21,8 +21,7 @@ from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count
 from halfspace_sss.comparison.model_errors import ReferenceSize, TracedMaps, model_error, reference_maps
 from halfspace_sss.executors import completed
-from halfspace_sss.interface.model import BSSRDF
-from halfspace_sss.interface.query import Query
+from halfspace_sss.interface.model import BSSRDF, Query
 from halfspace_sss.maps.noisy_maps import draw_directions, make_pool, radial_edges
 from halfspace_sss.neural.network import N_FEATURES, RELU, SILU, Network, layer_shapes
 from halfspace_sss.neural.paper_model import N_INPUTS, T_SMALLEST, NeuralPaper, query_inputs

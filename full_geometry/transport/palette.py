@@ -47,8 +47,7 @@ from full_geometry.transport.half_space import HalfSpaceProposals, positions_of
 from full_geometry.walk.random_walk import pick
 from halfspace_sss import measure
 from halfspace_sss.arrays import broadcast_query
-from halfspace_sss.interface.model import BSSRDF
-from halfspace_sss.interface.query import Query
+from halfspace_sss.interface.model import BSSRDF, Query
 from halfspace_sss.neural.network import SymmetricModel
 from halfspace_sss.neural.reduced import MODES, ReducedNetworks, shape_over_power
 from halfspace_sss.physics.fresnel import F_t

@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from halfspace_sss.arrays import Lanes, Library, Real, is_torch, library
-from halfspace_sss.interface.model import BSSRDF
-from halfspace_sss.interface.query import Query
+from halfspace_sss.interface.model import BSSRDF, Query
 from halfspace_sss.neural.perceptron import Perceptron, relu, silu
 from halfspace_sss.physics.backbone import U_MAX, backbone_shape, length_scale, warp
 from halfspace_sss.physics.medium import Medium

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from halfspace_sss.arrays import Library, Real
-from halfspace_sss.interface.model import BSSRDF
-from halfspace_sss.interface.query import Query
+from halfspace_sss.interface.model import BSSRDF, Query
 from halfspace_sss.neural.material_model import load_network
 from halfspace_sss.neural.network import RELU, Network, channel_queries, channels
 from halfspace_sss.neural.store import find_weights, load_weights, record_number

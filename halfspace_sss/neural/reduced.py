@@ -28,7 +28,7 @@ from functools import cached_property
 import numpy as np
 
 from halfspace_sss.arrays import Lanes, Real, library
-from halfspace_sss.interface.query import Query
+from halfspace_sss.interface.model import Query
 from halfspace_sss.neural.network import (
     LOG_RANGE,
     Network,

@@ -18,7 +18,7 @@ from analytic_models.photon_beam_diffusion import PhotonBeamDiffusion
 from analytic_models.standard_dipole import StandardDipole, StandardDipoleNormalized
 from halfspace_sss import Medium
 from halfspace_sss.arrays import library
-from halfspace_sss.interface.query import Query
+from halfspace_sss.interface.model import Query
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.fresnel import F_r, F_t, boundary_A, boundary_A_jensen
 from halfspace_sss.physics.medium import eval_hg

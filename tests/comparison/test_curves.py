@@ -12,8 +12,7 @@ import halfspace_sss
 from halfspace_sss import Medium, measure
 from halfspace_sss.comparison.curve_set import TRACED, CurveSet
 from halfspace_sss.comparison.reflectance_curves import default_paths, default_range
-from halfspace_sss.interface.model import BSSRDF
-from halfspace_sss.interface.query import Query
+from halfspace_sss.interface.model import BSSRDF, Query
 from halfspace_sss.physics import single_scattering
 
 FIG10 = Medium.from_albedo(0.75, 0.241)

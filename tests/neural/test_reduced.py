@@ -15,7 +15,7 @@ import drjit as dr  # noqa: E402
 from drjit.llvm import Float  # noqa: E402
 
 from halfspace_sss.arrays import broadcast_query  # noqa: E402
-from halfspace_sss.interface.query import Query  # noqa: E402
+from halfspace_sss.interface.model import Query  # noqa: E402
 
 ALBEDOS = np.linspace(0.6, 0.99, 9)
 G, ETA, N = 0.3, 1.4, 4096
