@@ -87,22 +87,15 @@ def shapes_of(scene: mi.Scene, groups: Sequence[Group]) -> list[mi.Shape]:
     return [*own, *(shape for group in groups for shape in group.shapes)]
 
 
-@dataclass(frozen=True, eq=False)
 class InstanceTable:
     """Numbers of shapes and of their instances in a scene, for look-ups in tables of kernels.
-    `shapes`: each once. `groups`: of each, or None for what stands in the scene itself. `first`: array (shapes + 1,),
-    the number of the first thing of each shape, then that of all things."""
+    `shapes`: each once. `groups`: of each, of those that are `shown`, or None for what stands in the scene itself.
+    `first`: array (shapes + 1,), the number of the first thing of each shape, then that of all things."""
 
-    shapes: list[mi.Shape]
-    groups: list[Group | None]
-    first: np.ndarray
-
-    @classmethod
-    def of(cls, shapes: list[mi.Shape], shown: Sequence[Group]) -> InstanceTable:
-        """Shapes of a scene that shows these groups."""
-        groups = [next((g for g in shown if any(s is shape for s in g.shapes)), None) for shape in shapes]
-        first = np.cumsum([0, *(1 if g is None else len(g.instances) for g in groups)])
-        return cls(shapes, groups, first)
+    def __init__(self, shapes: list[mi.Shape], shown: Sequence[Group]) -> None:
+        self.shapes = shapes
+        self.groups = [next((g for g in shown if any(s is shape for s in g.shapes)), None) for shape in shapes]
+        self.first = np.cumsum([0, *(1 if g is None else len(g.instances) for g in self.groups)])
 
     def __len__(self) -> int:
         return int(self.first[-1])

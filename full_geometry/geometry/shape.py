@@ -329,7 +329,7 @@ PLACES = (*mesh.GEOMETRY, "to_world", "grid", "control_points", "data", "extent"
 
 def geometry_of(shape: mi.Shape) -> Snapshot:
     """A snapshot of the parameters that say where a shape is."""
-    return Snapshot.of(shape, PLACES.__contains__)
+    return Snapshot(shape, PLACES.__contains__)
 
 
 def matrix_of(to_world: mi.Transform4f) -> np.ndarray:

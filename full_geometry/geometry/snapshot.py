@@ -22,21 +22,19 @@ from full_geometry.geometry import mesh
 class Snapshot:
     """Objects of Mitsuba, which are kept, and checksums of their parameters; equal to another where nothing differs."""
 
-    def __init__(self, nodes: list[mi.Object], checksums: dict[str, bytes]) -> None:
-        self._nodes, self._checksums = nodes, checksums
-
-    @classmethod
-    def of(
-        cls, root: mi.Object, wanted: Callable[[str], bool] | None = None, without: tuple[type, ...] = ()
-    ) -> Snapshot:
+    def __init__(
+        self, root: mi.Object, wanted: Callable[[str], bool] | None = None, without: tuple[type, ...] = ()
+    ) -> None:
         """Take the snapshot of an object and all that it holds.
         `wanted`: whether a parameter of this name counts; by default all do. `without`: classes of objects that do not
         count."""
-        parameters, checksums = mi.traverse(root), {}
-        for key, value in parameters.items():
-            if not isinstance(parameters.properties[key][2], without) and (wanted is None or wanted(key)):
-                checksums[key] = _checksum(value)
-        return cls([node for node in parameters.hierarchy if not isinstance(node, without)], checksums)
+        parameters = mi.traverse(root)
+        self._nodes = [node for node in parameters.hierarchy if not isinstance(node, without)]
+        self._checksums = {
+            key: _checksum(value)
+            for key, value in parameters.items()
+            if not isinstance(parameters.properties[key][2], without) and (wanted is None or wanted(key))
+        }
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Snapshot):

@@ -284,7 +284,7 @@ def _check(obj: TranslucentObject, light: str) -> None:
 
 def light_state(scene: mi.Scene) -> Snapshot:
     """What tells whether anything that sends, blocks or scatters light has changed."""
-    return Snapshot.of(scene, without=(mi.Scene, mi.Integrator, mi.Sensor, mi.Film, mi.Sampler))
+    return Snapshot(scene, without=(mi.Scene, mi.Integrator, mi.Sensor, mi.Film, mi.Sampler))
 
 
 def _lit(

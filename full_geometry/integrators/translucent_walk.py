@@ -213,7 +213,7 @@ def _class(variant: str) -> type:
             if tracer.visitor.unscattered is None or not sensor.film().rfilter().is_box_filter():
                 return None
             trial = max(FEWEST_TRIALS, min(spp // 8, TRIALS))
-            state = trial, Snapshot.of(sensor), light_state(scene)
+            state = trial, Snapshot(sensor), light_state(scene)
             if self._glints[0] != state:
                 self._glints = state, glints_of(tracer, sensor, trial)
             return self._glints[1]

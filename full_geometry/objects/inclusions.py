@@ -57,8 +57,8 @@ def find_inclusions(scene: mi.Scene, objects: list[Geometry]) -> list[Inclusion]
     What shines or lets light through counts from the depth on that rays tell. ValueError if the surface of such a shape
     lies on that of an object, so that rays do not tell which comes first; or it is a thin wall."""
     groups, results = shown_groups(scene), []
-    holders = InstanceTable.of([obj.shape for obj in objects], groups)
-    things = InstanceTable.of(shapes_of(scene, groups), groups)
+    holders = InstanceTable([obj.shape for obj in objects], groups)
+    things = InstanceTable(shapes_of(scene, groups), groups)
     for a, shape in enumerate(things.shapes):
         alone, group = None, things.groups[a]
         for b, holder in enumerate(objects):
@@ -271,7 +271,7 @@ def place_of(emitter: mi.Emitter) -> np.ndarray | None:
 def check_sensors(scene: mi.Scene, objects: list[Geometry]) -> None:
     """Refuse sensors inside of objects, of any kind: they may have several places, or a surface.
     ValueError if rays of a sensor begin inside an object, whose id is named."""
-    holders = InstanceTable.of([obj.shape for obj in objects], shown_groups(scene))
+    holders = InstanceTable([obj.shape for obj in objects], shown_groups(scene))
     for sensor in scene.sensors():
         for b, each in enumerate(objects):
             if is_inside(each, _into(holders.to_world(b), _starts(sensor, each.size))).any():

@@ -75,7 +75,7 @@ class Inclusions:
         surfaces = [surface_of(shape) for shape in shapes]
         below = [surface and surface.spec for surface in surfaces]
         specs = [spec and replace(spec, medium=spec.medium.scaled(mm_per_unit)) for spec in below]
-        return cls(result, scene_of(shapes, world), specs, [Snapshot.of(shape.bsdf()) for shape in shapes])
+        return cls(result, scene_of(shapes, world), specs, [Snapshot(shape.bsdf()) for shape in shapes])
 
     @property
     def shapes(self) -> list[mi.Shape]:
@@ -84,7 +84,7 @@ class Inclusions:
 
     def is_current(self) -> bool:
         """Whether the surfaces still are as they were."""
-        return all(Snapshot.of(shape.bsdf()) == state for shape, state in zip(self.shapes, self.surfaces))
+        return all(Snapshot(shape.bsdf()) == state for shape, state in zip(self.shapes, self.surfaces))
 
     def check_held(self) -> None:
         """ValueError if gradients are enabled for a parameter of them: a transport knows no other."""
@@ -105,7 +105,7 @@ def with_inclusions(scene: mi.Scene, objects: list[Geometry], mm_per_unit: float
     `scene`, `objects`: as of `find_inclusions`. `mm_per_unit`: length of a scene unit, mm. `what`: sees neither lamps
     inside objects, nor what lies partly inside. ValueError names such a thing and the object."""
     result = find_inclusions(scene, objects)
-    kinds = InstanceTable.of([obj.shape for obj in objects], shown_groups(scene)).kind
+    kinds = InstanceTable([obj.shape for obj in objects], shown_groups(scene)).kind
     for inclusion in result:
         holder = objects[kinds[inclusion.object]]
         lamp = isinstance(inclusion.node, mi.Emitter) or inclusion.node.is_emitter()
@@ -340,7 +340,7 @@ class TranslucentObject:
     def is_current(self) -> bool:
         """Whether the object still has the shape and the medium that it was made of."""
         textured, shape = self.surface.spec.textured, self.geometry.shape
-        same = textured is None or self.painted == Snapshot.of(shape)
+        same = textured is None or self.painted == Snapshot(shape)
         if textured is not None and self.textured is None:  # its textures are the same everywhere
             with dr.resume_grad():
                 same = same and not textured.is_followed(shape)

@@ -36,25 +36,18 @@ Number = "mi.Float | np.ndarray | float"
 UNKNOWN = {"albedo": 0.5, "reflectance": 0.2, "sigma_t": 1.0, "mfp": 1.0}  # means of attributes before a mesh is known
 
 
-@dataclass(frozen=True, eq=False)
 class AlbedoTable:
     """The albedo a(R) of half-spaces of one index, from x of `physics.reflectance` over sqrt(R / most).
-    `g`: of each channel. `most`: reflectance of albedo 1 of each channel; a(R) = 1 above it. `tables`: by g."""
+    `g`: mean cosine of each channel. `eta`: relative index. `most`: reflectance of albedo 1 of each channel; a(R) = 1
+    above it."""
 
-    g: list[float]
-    most: np.ndarray
-    tables: dict[float, mi.Texture1f]
-
-    @classmethod
-    def of(cls, g: list[float], eta: float) -> AlbedoTable:
-        """Tabulate a(R) for a mean cosine of each channel and a relative index."""
+    def __init__(self, g: list[float], eta: float) -> None:
         most = {each: half_space_reflectance(1.0, each, eta) for each in set(g)}
-        tables = {}
+        self.g, self.most, self.tables = g, np.array([most[each] for each in g]), {}
         for each, top in most.items():
             albedo = albedo_of_reflectance(top * np.linspace(0, 1, NODES) ** 2, each, eta)
             x = mi.TensorXf(x_of_albedo(np, albedo, each, bend(each)).astype(np.float32)[:, None])
-            tables[each] = mi.Texture1f(x, use_accel=False, wrap_mode=dr.WrapMode.Clamp)
-        return cls(g, np.array([most[each] for each in g]), tables)
+            self.tables[each] = mi.Texture1f(x, use_accel=False, wrap_mode=dr.WrapMode.Clamp)
 
     def warn_of_clipped(self, values: np.ndarray) -> None:
         """Warn of the rows of reflectance that no medium has, which are clipped."""
@@ -385,7 +378,7 @@ def textured_medium(values: dict[str, Any], g: np.ndarray | float, eta: float, c
     color, extent = (values[key] for key in (("reflectance", "mfp") if painted else ("albedo", "sigma_t")))
     table, inverse = None, painted and isinstance(extent, mi.Texture)
     if painted and isinstance(color, mi.Texture):
-        table = AlbedoTable.of(np.broadcast_to(np.asarray(g, dtype=float), channels).tolist(), eta)
+        table = AlbedoTable(np.broadcast_to(np.asarray(g, dtype=float), channels).tolist(), eta)
     elif painted:
         color = Medium.from_reflectance(np.broadcast_to(color, channels), 1.0, g, eta).albedo
     if painted and not inverse:

@@ -233,25 +233,15 @@ def check_boundary(name: str, boundary: mi.BSDF) -> None:
 # The reflection of a dielectric boundary, which is always seen from outside: no path of surfaces leads inside.
 
 
-@dataclass(frozen=True, eq=False)
 class Reflection:
-    """The reflecting lobe of a boundary, whichever way the normals of the object point.
+    """The reflecting lobe of a boundary, a BSDF of Mitsuba, whichever way the normals of the object point.
+    `lobe`: number of its component that reflects. ValueError if it does not reflect."""
 
-    Args:
-        boundary: a Mitsuba BSDF.
-        lobe: number of its component that reflects.
-    """
-
-    boundary: mi.BSDF
-    lobe: int
-
-    @classmethod
-    def of(cls, boundary: mi.BSDF) -> Reflection:
-        """The reflection of a boundary; ValueError if it does not reflect."""
-        for k in range(boundary.component_count()):
-            if boundary.flags(k) & int(mi.BSDFFlags.Reflection):
-                return cls(boundary, k)
-        raise ValueError(f"the boundary must reflect, got {boundary}")
+    def __init__(self, boundary: mi.BSDF) -> None:
+        lobes = (k for k in range(boundary.component_count()) if boundary.flags(k) & int(mi.BSDFFlags.Reflection))
+        self.boundary, self.lobe = boundary, next(lobes, None)
+        if self.lobe is None:
+            raise ValueError(f"the boundary must reflect, got {boundary}")
 
     def sample(
         self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, u: mi.Float, v: mi.Point2f, active: mi.Bool
@@ -320,7 +310,7 @@ def _class(variant: str) -> type:
             self.spec = read_medium_spec(props)
             check_model(self.spec.model)
             self.boundary = boundary_of([inner for _, inner in _boundaries(props)], self.spec.medium.eta)
-            self.reflection = Reflection.of(self.boundary)
+            self.reflection = Reflection(self.boundary)
             self.m_components = [self.boundary.flags(self.reflection.lobe)]
             self.m_flags = self.m_components[0]
             self.directional: HalfSpaceAlbedo | None = None  # made when it is asked for

@@ -184,7 +184,7 @@ class NeuralShape(Transport):
     @functools.cached_property
     def held(self) -> HeldLight:
         """How much light leaves it, as its medium changes."""
-        return HeldLight.of(self)
+        return HeldLight(self)
 
     @functools.cached_property
     def _network(self) -> Perceptron:
@@ -267,33 +267,23 @@ def calibrated(model: NeuralShape) -> NeuralShape:
     return replace(model, scales=tuple((np.array(model.scales or 1.0) * ratio**weights).tolist()))
 
 
-@dataclass(frozen=True, eq=False)
 class HeldLight:
-    """How B and <S> of a model change with its medium: B by the scores of walks, <S> by the same pairs.
-    `model`: calibrated. `scores`: d ln B by sigma_s, sigma_t (scene units) and g, (3, channels). `exits`, `entries`,
-    `over`: pairs, as of `_drawn`."""
+    """How B and <S> of a calibrated model change with its medium: B by the scores of walks, <S> by the same pairs.
+    `scores`: d ln B by sigma_s, sigma_t (scene units) and g, (3, channels). `pairs`: as of `_drawn`."""
 
-    model: NeuralShape
-    scores: np.ndarray
-    exits: SurfacePoint
-    entries: SurfacePoint
-    over: mi.Float
-
-    @classmethod
-    def of(cls, model: NeuralShape) -> HeldLight:
+    def __init__(self, model: NeuralShape) -> None:
         obj = model.object
         starts = obj.random_points(generator(mi, SCORED, pass_seed(SEED, 4)))
         throughput, score = trace_scores(obj, starts, (SEED, 5))
         T, n, d, g = _rows(throughput), score.n.numpy(), score.d.numpy(), _rows(score.g)
         sigma_s = np.maximum([float(m.sigma_s) for m in obj.media], 1e-30)
         parts = (T * n).mean(axis=1) / sigma_s, -(T * d).mean(axis=1), (T * g).mean(axis=1)
-        pairs = _drawn(model, EntryProposals(obj, model.half_space), COMPARED, 0)
-        B = np.maximum(T.mean(axis=1), 1e-30)
-        return cls(model, np.array(parts) / B, *pairs)
+        self.model, self.scores = model, np.array(parts) / np.maximum(T.mean(axis=1), 1e-30)
+        self.pairs = _drawn(model, EntryProposals(obj, model.half_space), COMPARED, 0)
 
     def spread(self, model: NeuralShape) -> np.ndarray:
         """<S> of each channel of a model of this object, by these pairs."""
-        return _values(model, self.exits, self.entries, self.over).mean(axis=1)
+        return _values(model, *self.pairs).mean(axis=1)
 
     @functools.cached_property
     def _bare(self) -> np.ndarray:

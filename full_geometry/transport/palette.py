@@ -120,31 +120,28 @@ def _places(n: int) -> list[float]:
     return [-math.cos(math.pi * (k + 0.5) / n) / math.cos(0.5 * math.pi / n) for k in range(n)]
 
 
-@dataclass(frozen=True, eq=False)
 class Palette:
     """Models at nodes of the albedo, in mean free paths.
 
     Args:
+        name: of the model.
+        albedos: that nodes have to cover, shape (n, channels).
+        extinctions: of all places, shape (n, channels).
+        media: of each channel; their g and eta hold.
+
+    Attributes:
         models: at the nodes of all channels.
         rows: of each channel.
         g: mean cosine of each channel.
         alike: whether extinction is the same everywhere.
         close: whether all extinctions, of all channels, are within a factor of `CLOSE`.
         networks: of the nodes of rows, by the number of their first, where the model is `neural`.
+
+    Raises:
+        ValueError: the model knows some media only.
     """
 
-    models: list[BSSRDF]
-    rows: list[NodeRange]
-    g: list[float]
-    alike: bool
-    close: bool
-    networks: dict[int, ReducedNetworks]
-
-    @classmethod
-    def of(cls, name: str, albedos: np.ndarray, extinctions: np.ndarray, media: Sequence[Medium]) -> Palette:
-        """The palette of a model.
-        `albedos`: that nodes have to cover, shape (n, channels). `extinctions`: of all places, shape (n, channels).
-        `media`: of each channel; their g and eta hold. ValueError if the model knows some media only."""
+    def __init__(self, name: str, albedos: np.ndarray, extinctions: np.ndarray, media: Sequence[Medium]) -> None:
         refusal = ""  # raised outside of the handler: messages of Mitsuba's functions are those of first causes
         try:
             model = bssrdf(name, Medium.from_albedo(0.5, 1.0, media[0].g, media[0].eta))
@@ -154,13 +151,16 @@ class Palette:
             refusal = str(error)
         if refusal:
             raise ValueError(f"model {name!r} must be one of any medium for media by textures: {refusal}")
-        models: list[BSSRDF] = []
-        rows: list[NodeRange] = []
-        networks: dict[int, ReducedNetworks] = {}
+        self.models: list[BSSRDF] = []
+        self.rows: list[NodeRange] = []
+        self.networks: dict[int, ReducedNetworks] = {}
+        self.g: list[float] = [m.g for m in media]
+        self.alike = bool((extinctions == extinctions[0]).all())
+        self.close = bool(extinctions.max() <= CLOSE * extinctions.min())
         for c, m in enumerate(media):
             sharing = [k for k, other in enumerate(media) if other.g == m.g]  # nodes
             if sharing[0] < c:
-                rows.append(rows[sharing[0]])
+                self.rows.append(self.rows[sharing[0]])
                 continue
             covered = albedos[:, sharing]
             ends = np.clip([covered.max(), covered.min()], LEAST, 1.0) if learnt else (1.0, LEAST)
@@ -168,13 +168,10 @@ class Palette:
             if learnt:  # so that slopes are known at the ends
                 low, high = max(low - 2 * V_STEP, 0.0), high + 2 * V_STEP
             nodes = np.clip(_albedo_of_v(np.linspace(low, high, NODES + 1), m.g, bend(m.g)), LEAST / 10, 1)
-            rows.append(NodeRange(len(models), NODES, low, (high - low) / NODES))
-            models += [bssrdf(name, Medium.from_albedo(float(a), 1.0, m.g, m.eta)) for a in nodes]
+            self.rows.append(NodeRange(len(self.models), NODES, low, (high - low) / NODES))
+            self.models += [bssrdf(name, Medium.from_albedo(float(a), 1.0, m.g, m.eta)) for a in nodes]
             if learnt:
-                networks[rows[-1].first] = ReducedNetworks.of(models[rows[-1].first :])
-        alike = bool((extinctions == extinctions[0]).all())
-        close = bool(extinctions.max() <= CLOSE * extinctions.min())
-        return cls(models, rows, [m.g for m in media], alike, close, networks)
+                self.networks[self.rows[-1].first] = ReducedNetworks(self.models[self.rows[-1].first :])
 
     @property
     def power(self) -> int:
@@ -447,7 +444,7 @@ def palette_model(
 
 def palette_of(name: str, geometry: Geometry, media: tuple[Medium, ...], medium: Varied) -> Palette:
     """The models of all media of an object; arguments and errors as of `palette_model`."""
-    return Palette.of(name, *_values_of(geometry, media, medium), media)
+    return Palette(name, *_values_of(geometry, media, medium), media)
 
 
 def _values_of(geometry: Geometry, media: tuple[Medium, ...], medium: Varied) -> tuple[np.ndarray, np.ndarray]:

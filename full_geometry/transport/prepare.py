@@ -84,7 +84,7 @@ def _make_object(geometry: Geometry, spec: MediumSpec, settings: Settings) -> Tr
         spec.textured.check(geometry)
         even = spec.textured.is_even(geometry.shape)
         textured = None if even else spec.textured.scaled(settings.mm_per_unit)
-        obj = replace(obj, textured=textured, painted=Snapshot.of(geometry.shape))
+        obj = replace(obj, textured=textured, painted=Snapshot(geometry.shape))
     if spec.spectral is not None:
         obj = replace(obj, spectral=spec.spectral.scaled(settings.mm_per_unit))
     single_only = spec.orders == "single" or not any(float(m.sigma_s) > 0 for m in media)

@@ -9,7 +9,6 @@ import socket
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from http import HTTPStatus
 from http.cookies import SimpleCookie
 from pathlib import Path
@@ -73,7 +72,7 @@ class Page:
         shown = "localhost" if host in LOOPBACK else socket.gethostname() if host in ("0.0.0.0", "::") else host
         self.url = f"http://{shown}:{self.server.get_port()}/" + (f"?token={self.token}" if self.token else "")
         self._woken, self._stopped = threading.Event(), False
-        self._controls = Controls.of(self.server.gui, self.live, self._wake, self._saved)
+        self._controls = Controls(self.server.gui, self.live, self._wake, self._saved)
         self._screens: dict[int, tuple[Any, Screen, Any]] = {}
         self._look()
         self.server.on_client_connect(self._joined)
@@ -180,28 +179,21 @@ def view(scene: dict[str, Any] | str | Path, **options: object) -> Page:
 # ---- The controls of the page ---------------------------------------------------------------------------------------
 
 
-@dataclass
 class Controls:
-    """Handles of viser, by what they are for."""
+    """Handles of viser by what they are for, of a live scene; they call `edited` and `saved`."""
 
-    light: dict[str, Any]
-    render: dict[str, Any]
-    media: dict[str, MediumControls] = field(default_factory=dict)
-
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         gui: viser.GuiApi,
         live: LiveScene,
         edited: Callable[[], None],
         saved: Callable[[str, viser.ClientHandle], str],
-    ) -> Controls:
-        """The controls of a live scene, which call `edited` and `saved`."""
+    ) -> None:
         models = [*([] if live.way.model else [OF_SURFACES]), *(m for m in model_names() if m != "auto"), PATH_TRACED]
         walks = live.way.model == PATH_TRACED
         lights = tuple(dict.fromkeys((*LIGHTS[walks], live.way.light)))
         with gui.add_folder("Picture"):
-            render = {
+            self.render: dict[str, Any] = {
                 "model": gui.add_dropdown("model", models, initial_value=live.way.model or OF_SURFACES),
                 "light": gui.add_dropdown("light", lights, initial_value=live.way.light),
                 "denoise": gui.add_checkbox("denoised", False),
@@ -210,16 +202,16 @@ class Controls:
                 "split": gui.add_slider("split", 0.0, 1.0, 0.01, 0.5),
             }
         with gui.add_folder("Light"):
-            light = {
+            self.light: dict[str, Any] = {
                 "turn": gui.add_slider("turn, degrees", -180.0, 180.0, 1.0, 0.0),
                 "tilt": gui.add_slider("tilt, degrees", -90.0, 90.0, 1.0, 0.0),
                 "stops": gui.add_slider("brightness, stops", -5.0, 5.0, 0.1, 0.0),
                 "environment": gui.add_dropdown("environment", [AS_THEY_ARE, *live.environments()]),
             }
-        result = cls(light, render)
+        self.media: dict[str, MediumControls] = {}
         for name in live.names:
             with gui.add_folder(name):
-                result.media[name] = MediumControls.of(gui, live.medium(name))
+                self.media[name] = MediumControls(gui, live.medium(name))
         with gui.add_folder("Save"):
             file = gui.add_text("file", f"{live.file.stem if live.file else 'scene'}_view.xml")
             said = gui.add_markdown("")
@@ -231,12 +223,6 @@ class Controls:
                 except (ValueError, OSError) as error:
                     said.content = f"**{error}**"
 
-        handles = [light, render, *(medium.handles for medium in result.media.values())]
-        for handle in [handle for each in handles for handle in each.values()]:
-            handle.on_update(result._hearing(edited))
-        return result
-
-    def _hearing(self, edited: Callable[[], None]) -> Callable[[Any], Any]:
         async def heard(event: viser.GuiEvent) -> None:
             if event.target is self.render["model"]:
                 lights = LIGHTS[event.target.value == PATH_TRACED]
@@ -246,7 +232,9 @@ class Controls:
                 medium.heard(event.target)
             edited()
 
-        return heard
+        handles = [self.light, self.render, *(medium.handles for medium in self.media.values())]
+        for handle in [handle for each in handles for handle in each.values()]:
+            handle.on_update(heard)
 
     def wish(self, camera: Camera) -> Wish:
         """What the controls ask for."""
@@ -259,18 +247,12 @@ class Controls:
         return Wish(Edits(**light, media=media), way, camera, render["exposure"], render["compare"], render["split"])
 
 
-@dataclass
 class MediumControls:
-    """Controls of a medium; a slider moves the mean free paths (mm) of all channels together."""
+    """Controls of a medium, as it is; a slider moves the mean free paths (mm) of all channels together."""
 
-    handles: dict[str, Any]
-    paths: np.ndarray
-
-    @classmethod
-    def of(cls, gui: viser.GuiApi, medium: Medium) -> MediumControls:
-        """The controls of a medium as it is."""
+    def __init__(self, gui: viser.GuiApi, medium: Medium) -> None:
         names = [AS_THEY_ARE, OWN, *materials.names()]
-        handles = {
+        self.handles: dict[str, Any] = {
             "material": gui.add_dropdown("material", names, initial_value=AS_THEY_ARE),
             "reflectance": gui.add_rgb("reflectance", (128, 128, 128)),
             "stops": gui.add_slider("mean free path, stops", -6.0, 6.0, 0.1, 0.0),
@@ -278,13 +260,11 @@ class MediumControls:
             "eta": gui.add_slider("eta", 1.0, 2.0, 0.01, 1.3),
             "roughness": gui.add_slider("roughness", 0.0, 0.5, 0.01, 0.0),
         }
-        result = cls(handles, np.ones(3))
-        result.show(medium)
-        return result
+        self.show(medium)
 
     def show(self, medium: Medium) -> None:
         """Bring the sliders to a medium."""
-        self.paths = np.broadcast_to(1 / np.maximum(medium.sigma_t, 1e-9), 3)
+        self.paths: np.ndarray = np.broadcast_to(1 / np.maximum(medium.sigma_t, 1e-9), 3)
         self.handles["reflectance"].value = _encoded(np.broadcast_to(medium.reflectance(), 3))
         self.handles["stops"].value, self.handles["eta"].value = 0.0, float(np.clip(medium.eta, 1.0, 2.0))
         self.handles["g"].value = float(np.clip(np.mean(medium.g), -0.9, 0.99))

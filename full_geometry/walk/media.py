@@ -82,7 +82,7 @@ class InclusionTable:
             return None
         # ---- what displaces the medium around it holds things of its own: these are looked for again
         groups = shown_groups(scene)
-        own = InstanceTable.of([obj.shape for obj in objects], groups)
+        own = InstanceTable([obj.shape for obj in objects], groups)
         _check(result, objects, own)
         glass: list[Geometry] = []
         while more := [s for s in _shapes(result) if _displaces(s) and not any(s is piece.shape for piece in glass)]:
@@ -93,10 +93,10 @@ class InclusionTable:
             result = find_inclusions(scene, [*objects, *glass])
 
         # ---- number shapes inside after the objects, each at all its places
-        holders = InstanceTable.of([obj.shape for obj in (*objects, *glass)], groups)
+        holders = InstanceTable([obj.shape for obj in (*objects, *glass)], groups)
         inside = [inclusion for inclusion in result if inclusion.object < len(own)]
         things = [thing for thing in _shapes(inside) if not any(thing is shape for shape in own.shapes)]
-        instance_table = InstanceTable.of([*own.shapes, *things], groups)
+        instance_table = InstanceTable([*own.shapes, *things], groups)
         first = {id(shape): int(number) for shape, number in zip(instance_table.shapes, instance_table.first)}
 
         # ---- what is around each: the smallest holder comes last and stays
@@ -398,7 +398,7 @@ class WalkMedia:
 
     def __post_init__(self) -> None:
         # ---- coefficients by the number of an object, 1/(scene unit)
-        instance_table = InstanceTable.of([obj.shape for obj in self.objects], self.shown)
+        instance_table = InstanceTable([obj.shape for obj in self.objects], self.shown)
         object.__setattr__(self, "instance_table", instance_table)
         specs, boundaries = ([rows[kind] for kind in instance_table.kind] for rows in (self.specs, self.boundaries))
         media, tables = [inside.medium for inside in specs], {}
@@ -750,7 +750,7 @@ class WalkMedia:
         check_sheets(shapes_of(scene, shown), mm_per_unit)
         if not shapes:
             raise ValueError(NO_OBJECT)
-        instance_table, objects = InstanceTable.of(shapes, shown), [analyse_shape(shape, scene) for shape in shapes]
+        instance_table, objects = InstanceTable(shapes, shown), [analyse_shape(shape, scene) for shape in shapes]
         inner = instance_table.scene(scene)
         for obj, group in zip(objects, instance_table.groups):
             inside = surface_of(obj.shape).spec

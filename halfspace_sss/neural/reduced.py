@@ -22,7 +22,6 @@ With one network, of the middle, the mean is 1.3, 1.8 and, for g = 0.8, 5.9 %.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -48,23 +47,20 @@ NEAREST, FURTHEST = 0.005, 8.0  # mean free paths, and length scales: distances 
 RIDGE = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
 class ReducedNetworks:
     """Functions phi of a query, and their coefficients for the albedo of each model.
-    `networks`: with phi_0 ... phi_4 for outputs, which are added up. `lengths`: L of the features of each.
-    `coefficients`: c of the models, shape (models, MODES)."""
 
-    networks: list[Network]
-    lengths: list[float]
-    coefficients: np.ndarray
+    Attributes:
+        networks: with phi_0 ... phi_4 for outputs, which are added up.
+        lengths: L of the features of each.
+        coefficients: c of the models, shape (models, MODES).
 
-    @classmethod
-    def of(cls, models: Sequence[SymmetricModel]) -> ReducedNetworks:
-        """Reduce models of one g and eta, in an order of albedos in which they are smooth.
+    Raises:
+        ValueError: a medium has derivatives, which would be lost.
+    """
 
-        Raises:
-            ValueError: a medium has derivatives, which would be lost.
-        """
+    def __init__(self, models: Sequence[SymmetricModel]) -> None:
+        """Reduce models of one g and eta, in an order of albedos in which they are smooth."""
         for m in models:
             check_numbers("medium", m.medium)
         q = _queries(max(_length(m) for m in models), models[0].medium.eta)
@@ -74,15 +70,14 @@ class ReducedNetworks:
         columns = [_hidden(m.networks[0], np.stack(_features(q, _length(m)), axis=1)) for m in kept]
         A = np.concatenate([*columns, np.ones((QUERIES, 1))], axis=1)
         rows = np.stack([_least_squares(A, y, w) for y, w in zip(wanted, weights)])
-        modes, c = _modes(rows, (A * weights.sum(axis=0)[:, None]).T @ A)
-        networks, at = [], 0
+        modes, self.coefficients = _modes(rows, (A * weights.sum(axis=0)[:, None]).T @ A)
+        self.networks, self.lengths, at = [], [_length(m) for m in kept], 0
         for k, m in enumerate(kept):
             net, width = m.networks[0], columns[k].shape[1]
             last = np.ascontiguousarray(modes[:, at : at + width].T, np.float32)
             bias = (modes[:, -1] * (k == 0)).astype(np.float32)
-            networks.append(Network((*net.matrices[:-1], last), (*net.biases[:-1], bias), net.activation))
+            self.networks.append(Network((*net.matrices[:-1], last), (*net.biases[:-1], bias), net.activation))
             at += width
-        return cls(networks, [_length(m) for m in kept], c)
 
     @cached_property
     def _perceptrons(self) -> list[Perceptron]:

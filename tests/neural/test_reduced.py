@@ -31,7 +31,7 @@ def test_reduced_networks_have_the_S_of_each_albedo() -> None:
     r = np.exp(np.log(0.02) + np.log(500) * u[0])
     angles = [np.sqrt(u[1]), 2 * np.pi * (u[2] - 0.5), np.sqrt(u[3]), 2 * np.pi * (u[4] - 0.5)]
     lib, args = broadcast_query(Float(r), *(Float(v) for v in angles))
-    q, reduced = Query(lib, *args, ETA), ReducedNetworks.of(models)
+    q, reduced = Query(lib, *args, ETA), ReducedNetworks(models)
     phi = np.array([np.array(v) for v in reduced.functions(q)])
     for model, c in zip(models, reduced.coefficients):
         albedo = float(model.medium.albedo)
@@ -46,11 +46,11 @@ def test_reduced_networks_have_the_S_of_each_albedo() -> None:
 
 
 def test_reduced_networks_are_the_same_each_time() -> None:
-    one, two = (ReducedNetworks.of(_models()) for _ in range(2))
+    one, two = (ReducedNetworks(_models()) for _ in range(2))
     assert np.array_equal(one.coefficients, two.coefficients)
 
 
 def test_media_with_derivatives_are_refused_by_name() -> None:
     g = pytest.importorskip("torch").tensor(G, requires_grad=True)
     with pytest.raises(ValueError, match="medium must be of numbers"):
-        ReducedNetworks.of([Neural(Medium.from_albedo(0.6, 1.0, g, ETA))])
+        ReducedNetworks([Neural(Medium.from_albedo(0.6, 1.0, g, ETA))])

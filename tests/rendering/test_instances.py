@@ -170,7 +170,7 @@ def test_each_shape_of_each_instance_has_a_number_of_its_own() -> None:
     wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -3]).scale(9)}
     scene = mi.load_dict(view(**shown(parts, places()), wall=wall))
     groups = shown_groups(scene)
-    instance_table = InstanceTable.of(shapes_of(scene, groups), groups)
+    instance_table = InstanceTable(shapes_of(scene, groups), groups)
     ray = mi.Ray3f(mi.Point3f([-1.3, 1.3, 0], [0.1, 0.1, 4], [8, 8, 8]), mi.Vector3f(0, 0, -1))
     number = np.array(instance_table.number(scene.ray_intersect(ray)))
     assert len(instance_table) == 5 and [instance_table.shapes[instance_table.kind[k]].id() for k in number[2:]] == [

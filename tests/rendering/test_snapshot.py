@@ -63,33 +63,33 @@ def test_every_number_of_every_parameter_counts() -> None:
     keys = [key for key in parameters.keys() if not key.endswith(left_out)]
     assert {"ball.bsdf.sigma_t", "group.tile.vertex_positions", "point.position", "sky.data"} <= set(keys)
     for key in keys:
-        kept, before = parameters[key], Snapshot.of(scene)
+        kept, before = parameters[key], Snapshot(scene)
         kept = type(kept)(kept)
         for number, value in _nudged(kept):
             parameters[key] = value
-            assert Snapshot.of(scene) != before, (key, number)
+            assert Snapshot(scene) != before, (key, number)
         parameters[key] = kept
-        assert Snapshot.of(scene) == before, key
+        assert Snapshot(scene) == before, key
 
 
 def test_what_is_written_into_an_array_counts() -> None:
     scene = _scene()
-    parameters, before = mi.traverse(scene), Snapshot.of(scene)
+    parameters, before = mi.traverse(scene), Snapshot(scene)
     parameters["group.tile.vertex_positions"].numpy()[:] += 1
-    assert Snapshot.of(scene) != before
+    assert Snapshot(scene) != before
 
 
 def test_the_same_values_in_other_variables_are_the_same() -> None:
     scene = _scene()
-    parameters, before = mi.traverse(scene), Snapshot.of(scene)
+    parameters, before = mi.traverse(scene), Snapshot(scene)
     for key in ("floor.bsdf.reflectance.data", "sky.data"):
         parameters[key] = type(parameters[key])(np.array(parameters[key]))
     parameters.update()
-    assert Snapshot.of(scene) == before
+    assert Snapshot(scene) == before
 
 
 def test_other_objects_with_the_same_values_are_not_the_same() -> None:
-    assert Snapshot.of(_scene()) != Snapshot.of(_scene())
+    assert Snapshot(_scene()) != Snapshot(_scene())
 
 
 def test_the_identity_of_a_scene_has_every_component_of_a_point() -> None:
