@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import matplotlib as mpl
 from matplotlib import colormaps
@@ -16,7 +16,7 @@ from matplotlib.textpath import TextPath
 
 from figures.computing.contenders import VOLUMES, WALK
 from figures.computing.images import FLIP, Shot, absent
-from figures.drawing.page import page
+from figures.drawing.page import check_scenes, page
 from figures.parts.part import Row
 from full_geometry.trade.image_differences import srgb
 from halfspace_sss.comparison.style import TEXT, look, paper, saved
@@ -38,44 +38,35 @@ def image_grid(scenes: Mapping[str, Sequence[Shot]], printed: Sequence[str] = (F
     Raises:
         ValueError: there is no scene, or one starts without an image.
     """
-    columns = _columns(scenes)
-    figure, cell = Figure(), (TEXT - NAME - GAP * (len(columns) - 1)) / len(columns)
-    rows = [_GridRow(name, list(shots), cell) for name, shots in scenes.items()]
-    height = TITLE + sum(row.height for row in rows) + ROW_GAP * (len(rows) - 1)
+    check_scenes(scenes)
+    columns = list(dict.fromkeys(shot.label for shots in scenes.values() for shot in shots))
+    figure, cell, rows = Figure(), (TEXT - NAME - GAP * (len(columns) - 1)) / len(columns), []
+    for name, shots in scenes.items():
+        image = cell * shots[0].image.shape[0] / shots[0].image.shape[1]
+        pictures = image + (GAP / 2 + image if any(s.flip is not None for s in shots) else 0.0)
+        rows.append(_GridRow(name, {shot.label: shot for shot in shots}, cell, image, pictures))
+    height = TITLE + sum(row.pictures + CAPTION for row in rows) + ROW_GAP * (len(rows) - 1)
     figure.set_size_inches(TEXT, height)
     page, size = _Page(figure, TEXT, height), _title_size(columns, cell)
     for k, label in enumerate(columns):
-        gone = all(_shot(row, label).image is None for row in rows)
+        gone = all(label not in row.shots or row.shots[label].image is None for row in rows)
         x = NAME + k * (cell + GAP) + cell / 2
         page.text(x, TITLE - 0.045, label, ha="center", va="bottom", fontsize=size, color=GREY if gone else "black")
     top = TITLE
     for row in rows:
         _draw_row(page, row, columns, top, printed)
-        top += row.height + ROW_GAP
+        top += row.pictures + CAPTION + ROW_GAP
     return figure
 
 
-@dataclass(frozen=True)
-class _GridRow:
-    """A scene, and the sizes of what is drawn of it in a cell of given width, inches."""
+class _GridRow(NamedTuple):
+    """A scene, its shots by label, the width of a cell, and the heights of an image and of it with its map, inches."""
 
     name: str
-    shots: list[Shot]
+    shots: dict[str, Shot]
     cell: float
-
-    @property
-    def image_height(self) -> float:
-        height, width = self.shots[0].image.shape[:2]
-        return self.cell * height / width
-
-    @property
-    def pictures_height(self) -> float:
-        """Of the image, and of the map below it if there is one."""
-        return self.image_height + (GAP / 2 + self.image_height if any(s.flip is not None for s in self.shots) else 0.0)
-
-    @property
-    def height(self) -> float:
-        return self.pictures_height + CAPTION
+    image: float
+    pictures: float
 
 
 class _Page:
@@ -95,34 +86,21 @@ class _Page:
         self.figure.text(x / self.width, 1 - y / self.height, text, **style)
 
 
-def _columns(scenes: Mapping[str, Sequence[Shot]]) -> list[str]:
-    if not scenes:
-        raise ValueError("scenes must hold at least one scene, got none")
-    for name, shots in scenes.items():
-        if not shots or shots[0].image is None:
-            raise ValueError(f"scene {name!r} must start with the image of its reference, got none")
-    return list(dict.fromkeys(shot.label for shots in scenes.values() for shot in shots))
-
-
-def _shot(row: _GridRow, label: str) -> Shot:
-    return next((shot for shot in row.shots if shot.label == label), absent(label))
-
-
 def _draw_row(page: _Page, row: _GridRow, columns: Sequence[str], top: float, printed: Sequence[str]) -> None:
-    page.text(NAME - 0.05, top + row.pictures_height / 2, row.name, rotation=90, ha="right", va="center")
-    numbers = [shot.numbers[printed[0]] for shot in row.shots if printed and printed[0] in shot.numbers]
+    page.text(NAME - 0.05, top + row.pictures / 2, row.name, rotation=90, ha="right", va="center")
+    numbers = [shot.numbers[printed[0]] for shot in row.shots.values() if printed and printed[0] in shot.numbers]
     best = min((v for v in numbers if not isinstance(v, str)), default=None)
     for k, label in enumerate(columns):
-        shot, x = _shot(row, label), NAME + k * (row.cell + GAP)
+        shot, x = row.shots.get(label, absent(label)), NAME + k * (row.cell + GAP)
         if shot.image is None:
-            _draw_absent(page.axes(x, top, row.cell, row.pictures_height), shot.why)
+            _draw_absent(page.axes(x, top, row.cell, row.pictures), shot.why)
             continue
-        page.axes(x, top, row.cell, row.image_height).imshow(srgb(shot.image), aspect="auto")
-        if row.pictures_height > row.image_height:
-            _draw_map(page, row, shot, x, top + row.image_height + GAP / 2)
+        page.axes(x, top, row.cell, row.image).imshow(srgb(shot.image), aspect="auto")
+        if row.pictures > row.image:
+            _draw_map(page, row, shot, x, top + row.image + GAP / 2)
         text = "   ".join(_said(column, shot.numbers[column]) for column in printed if column in shot.numbers)
         weight = "bold" if printed and best is not None and shot.numbers.get(printed[0]) == best else "normal"
-        below = top + row.pictures_height + 0.02
+        below = top + row.pictures + 0.02
         size = 6.5 * min(1.0, 72 * row.cell / max(_text_width(text, 6.5, weight), 1e-6))
         page.text(x + row.cell / 2, below, text, ha="center", va="top", fontsize=size, fontweight=weight)
 
@@ -130,27 +108,17 @@ def _draw_row(page: _Page, row: _GridRow, columns: Sequence[str], top: float, pr
 def _draw_absent(ax: Axes, why: str) -> None:
     ax.set_facecolor(PALE)
     ax.spines[:].set(visible=True, color=GREY, linewidth=0.4, linestyle=(0, (4, 3)))
-    ax.text(
-        0.5,
-        0.5,
-        why,
-        transform=ax.transAxes,
-        ha="center",
-        va="center",
-        color=GREY,
-        fontsize=6.5,
-        style="italic",
-        wrap=True,
-    )
+    style = {"ha": "center", "va": "center", "color": GREY, "fontsize": 6.5, "style": "italic", "wrap": True}
+    ax.text(0.5, 0.5, why, transform=ax.transAxes, **style)
 
 
 def _draw_map(page: _Page, row: _GridRow, shot: Shot, left: float, top: float) -> None:
     """The FLIP map or, for a reference, the scale of the maps."""
     if shot.flip is not None:
-        ax = page.axes(left, top, row.cell, row.image_height)
+        ax = page.axes(left, top, row.cell, row.image)
         ax.imshow(shot.flip, cmap="magma", vmin=0, vmax=1, aspect="auto")
         return
-    bar = page.axes(left + 0.02, top + row.image_height - 0.09, row.cell - 0.04, 0.05)
+    bar = page.axes(left + 0.02, top + row.image - 0.09, row.cell - 0.04, 0.05)
     scale = page.figure.colorbar(ScalarMappable(Normalize(0, 1), colormaps["magma"]), cax=bar, orientation="horizontal")
     scale.outline.set_linewidth(0.3)
     scale.set_ticks([])

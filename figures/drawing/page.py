@@ -51,10 +51,7 @@ def page(
     Raises:
         ValueError: there is no scene, a scene starts without an image, or its images and maps differ in size.
     """
-    if not scenes:
-        raise ValueError("scenes must hold at least one scene, got none")
-    for name, shots in scenes.items():
-        _check(name, shots)
+    check_scenes(scenes)
     given = dict.fromkeys(column for shots in scenes.values() for shot in shots for column in shot.numbers)
     columns = [column for column in lower_is_better if column in given]
     columns += [column for column in given if column not in columns]
@@ -74,18 +71,23 @@ def _file(name: str) -> str:
     return resources.files("figures").joinpath("page_files", name).read_text(encoding="utf-8")
 
 
-def _check(name: str, shots: Sequence[Shot]) -> None:
-    if not shots or shots[0].image is None:
-        raise ValueError(f"scene {name!r} must start with the image of its reference, got none")
-    labels = [shot.label for shot in shots]
-    if len(set(labels)) < len(labels):
-        raise ValueError(f"labels of scene {name!r} must differ, got {labels!r}")
-    size = np.shape(shots[0].image)[:2]
-    for shot in shots:
-        for kind in ("image", "flip", "difference"):
-            pixels = getattr(shot, kind)
-            if pixels is not None and np.shape(pixels)[:2] != size:
-                raise ValueError(f"{kind} of {shot.label!r} in {name!r} must have the size {size}, got {pixels.shape}")
+def check_scenes(scenes: Mapping[str, Sequence[Shot]]) -> None:
+    """ValueError if there is no scene, one starts without an image, or its images and maps differ in size."""
+    if not scenes:
+        raise ValueError("scenes must hold at least one scene, got none")
+    for name, shots in scenes.items():
+        if not shots or shots[0].image is None:
+            raise ValueError(f"scene {name!r} must start with the image of its reference, got none")
+        labels = [shot.label for shot in shots]
+        if len(set(labels)) < len(labels):
+            raise ValueError(f"labels of scene {name!r} must differ, got {labels!r}")
+        size = np.shape(shots[0].image)[:2]
+        for shot in shots:
+            for kind in ("image", "flip", "difference"):
+                map_of = getattr(shot, kind)
+                if map_of is not None and np.shape(map_of)[:2] != size:
+                    told = f"must have the size {size}, got {map_of.shape}"
+                    raise ValueError(f"{kind} of {shot.label!r} in {name!r} {told}")
 
 
 def _scene(name: str, shots: Sequence[Shot], exposure: float) -> JsonDict:
