@@ -4,18 +4,8 @@ views = inverse.read_views("views.json")
 result = inverse.fit(scene, views, parameters=("albedo", "sigma_t"))      # scene: a file, a dict or a Mitsuba scene
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
-from halfspace_sss.lazy import lazy_names
-
-if TYPE_CHECKING:
-    from full_geometry.inverse.comparing import FitSettings, MaterialFit
-    from full_geometry.inverse.fitting import fit
-    from full_geometry.inverse.views import GivenView, read_views
+from full_geometry.inverse.comparing import FitSettings, MaterialFit
+from full_geometry.inverse.fitting import fit
+from full_geometry.inverse.views import GivenView, read_views
 
 __all__ = ["MaterialFit", "FitSettings", "GivenView", "fit", "read_views"]
-
-MODULES = {"comparing": ["MaterialFit", "FitSettings"], "fitting": ["fit"], "views": ["GivenView", "read_views"]}
-__getattr__, __dir__ = lazy_names(__name__, MODULES)
