@@ -74,15 +74,6 @@ def prefer_bundled_llvm() -> None:
         os.environ.setdefault("DRJIT_LIBLLVM_PATH", str(bundled[0]))
 
 
-def _refuse_old_loaded_llvm() -> None:
-    """Whichever LLVM Dr.Jit has loaded is the one that will compile."""
-    import drjit as dr
-
-    version = dr.detail.llvm_version()
-    if version is None or version[0] < OLDEST_LLVM:
-        raise BackendError(_told_of_loaded(version))
-
-
 def _told_of_loaded(version: tuple[int, int, int] | None) -> str:
     """A sentence on the LLVM that Dr.Jit has loaded, which is too old, and what helps."""
     given = os.environ.get("DRJIT_LIBLLVM_PATH")
@@ -101,8 +92,12 @@ def prepare_llvm() -> None:
     """See to it that Dr.Jit uses an LLVM that works; a path that the user set is kept.
     BackendError if none is found, the one the user set is too old or cannot be loaded, or Dr.Jit was imported before
     with an old one, which would abort the process."""
-    if "drjit" in sys.modules:
-        _refuse_old_loaded_llvm()
+    if "drjit" in sys.modules:  # whichever LLVM it has loaded is the one that will compile
+        import drjit as dr
+
+        loaded = dr.detail.llvm_version()
+        if loaded is None or loaded[0] < OLDEST_LLVM:
+            raise BackendError(_told_of_loaded(loaded))
         return
     given = os.environ.get("DRJIT_LIBLLVM_PATH")
     if given:

@@ -95,7 +95,12 @@ def check_folder(folder: str | Path) -> Path:
     """The folder as a path; ValueError if it, or what it would lie in, is a file or cannot be written to."""
     path = path_of(folder)
     if is_remote(path):
-        _check_store(path)
+        probe = path / f".{platform.node()}.{os.getpid()}"
+        try:
+            probe.write_bytes(b"1")
+            probe.unlink()
+        except Exception as error:  # packages of object stores raise errors of their own kinds
+            raise ValueError(f"folder must be one that can be written to, got {str(path)!r}: {error}") from error
         return path
     part = next(part for part in (path, *path.absolute().parents) if part.exists())
     if not part.is_dir():
@@ -106,16 +111,6 @@ def check_folder(folder: str | Path) -> Path:
     except OSError as error:
         raise ValueError(f"folder must be one that can be written to, got {str(folder)!r}: {error.strerror}") from error
     return path
-
-
-def _check_store(path: Path) -> None:
-    """That an object store can be written to; its packages raise errors of their own kinds."""
-    probe = path / f".{platform.node()}.{os.getpid()}"
-    try:
-        probe.write_bytes(b"1")
-        probe.unlink()
-    except Exception as error:
-        raise ValueError(f"folder must be one that can be written to, got {str(path)!r}: {error}") from error
 
 
 def read_bytes(path: str | Path, most: int = LARGEST) -> bytes:

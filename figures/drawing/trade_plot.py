@@ -28,7 +28,9 @@ def render(picture: TradePicture) -> dict[str, bytes]:
         with paper():
             files = saved(draw(shown, picture.tolerance))
     if picture.images:
-        files["html"] = _page(picture).encode()
+        caption, shots = picture.sentences[0] if picture.sentences else "", image_shots(picture.images, picture.found)
+        exposure = _exposure(picture.images[TRACED])
+        files["html"] = page(picture.title, {picture.title: shots}, exposure=exposure, caption=caption).encode()
     return files
 
 
@@ -39,7 +41,9 @@ def draw(objects: Sequence[ObjectTrade], tolerance: float) -> Figure:
     grid = figure.subplots(len(objects), 2, squeeze=False)
     handles: dict[str, object] = {}
     for each, (left, right) in zip(objects, grid):
-        handles |= trade_panels(each, left, right, tolerance)
+        rows = [w for w in each.ways if not w.refusal and w.variance > 0]
+        handles |= pareto(left, rows, each.pixels, tolerance)
+        _overtime_to_noise(right, rows, each.pixels, tolerance)
         left.set_title(f"{each.object}: {span_in_mfp(each)} mean free paths across", pad=3)
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, frameon=False)
     return figure
@@ -49,14 +53,6 @@ def span_in_mfp(assessed: ObjectTrade) -> str:
     """Mean free paths across an object, of all channels."""
     low, high = (f"{v:.3g}" for v in assessed.mfp)
     return low if low == high else f"{low} to {high}"
-
-
-def trade_panels(assessed: ObjectTrade, left: Axes, right: Axes, tolerance: float) -> dict[str, object]:
-    """Draw an object; the handles of the legend by label."""
-    rows = [w for w in assessed.ways if not w.refusal and w.variance > 0]
-    handles = pareto(left, rows, assessed.pixels, tolerance)
-    _overtime_to_noise(right, rows, assessed.pixels, tolerance)
-    return handles
 
 
 def _look(way: str) -> Look:
@@ -159,12 +155,6 @@ def image_shots(images: Mapping[str, np.ndarray], assessment: Assessment) -> lis
 def _exposure(reference: np.ndarray) -> float:
     bright = float(np.percentile(reference, 99.0))
     return math.log2(0.9 / bright) if bright > 0 else 0.0
-
-
-def _page(picture: TradePicture) -> str:
-    shots = image_shots(picture.images, picture.found)
-    caption = picture.sentences[0] if picture.sentences else ""
-    return page(picture.title, {picture.title: shots}, exposure=_exposure(picture.images[TRACED]), caption=caption)
 
 
 def _numbers(row: TechniqueTrade) -> dict[str, float | str]:

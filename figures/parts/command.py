@@ -120,7 +120,9 @@ def _completed(chosen: FigureOptions, places: Places, variant: str) -> Iterator[
         use_mitsuba(variant)
     plans = chosen.plans()
     if places == Places() and variant == "llvm_ad_rgb" and chosen.quality == "draft":
-        places = Places(workers=_workers(plans))
+        # drafts have parts too small for several threads: processes
+        number = min(cores(), MOST_WORKERS, len({p.keys[name] for p in plans for name in p.missing}))
+        places = Places(workers=number if number > 1 else None)
     _announce(plans)
     started = time.perf_counter()
     with places.executor() as executor, Bar(plans[0].name if len(plans) == 1 else "figures") as bar:
@@ -130,12 +132,6 @@ def _completed(chosen: FigureOptions, places: Places, variant: str) -> Iterator[
                 yield p
     if any(p.missing for p in plans):
         say(f"computed in {duration(time.perf_counter() - started)}")
-
-
-def _workers(plans: Sequence[Plan]) -> int | None:
-    """Processes for drafts, whose parts are too small for several threads; None for this one."""
-    number = min(cores(), MOST_WORKERS, len({p.keys[name] for p in plans for name in p.missing}))
-    return number if number > 1 else None
 
 
 def _time(p: Plan) -> str:

@@ -149,7 +149,8 @@ class _File:
             raise ValueError(f"{self.path}: cameras must be perspective, got {camera.type} of {node.name!r}")
         aspect, said = seen.aspectRatio or 1.0, {**(camera.extras or {}), **(node.extras or {})}
         width = int(said.get("width", round(PIXELS * min(aspect, 1.0))))
-        film = _film(width, int(said.get("height", max(round(width / aspect), 1))))
+        height = int(said.get("height", max(round(width / aspect), 1)))
+        film = {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}}
         seen_from = {"to_world": _turned(place), "near_clip": seen.znear, "far_clip": seen.zfar or 1e4}
         return {"type": "perspective", "fov": math.degrees(seen.yfov), "fov_axis": "y", **seen_from, "film": film}
 
@@ -385,7 +386,3 @@ def _light(light: dict[str, Any], place: np.ndarray) -> dict[str, Any]:
 def _turned(place: np.ndarray) -> mi.ScalarTransform4f:
     """Where a camera or a spot stands, without the scale of its node."""
     return mi.ScalarTransform4f(place / [*np.linalg.norm(place[:3, :3], axis=0), 1.0] @ TURN)
-
-
-def _film(width: int, height: int) -> dict[str, Any]:
-    return {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}}

@@ -49,7 +49,12 @@ def with_media(
     for node in list(state.nodes):
         if node.type == mi.ObjectType.Shape:
             _fill(config, state, node.props, mm_per_unit)
-    _replace_integrator(state, integrator or VOLUME_PATH)
+    root = state.nodes[0].props
+    for key, index in references(root).items():
+        node = state.nodes[index]
+        if node.type == mi.ObjectType.Integrator or node.props.plugin_name() in ("bssrdf", "translucent_walk"):
+            del root[key]
+    root["integrator"] = mi.load_dict(integrator or VOLUME_PATH)
     return mi.parser.instantiate(config, state)
 
 
@@ -76,15 +81,6 @@ def _instance(config: mi.parser.ParserConfig, state: mi.parser.ParserState, inde
         return mi.parser.instantiate(config, state)
     finally:
         state.nodes[0] = root
-
-
-def _replace_integrator(state: mi.parser.ParserState, integrator: dict) -> None:
-    root = state.nodes[0].props
-    for key, index in references(root).items():
-        node = state.nodes[index]
-        if node.type == mi.ObjectType.Integrator or node.props.plugin_name() in ("bssrdf", "translucent_walk"):
-            del root[key]
-    root["integrator"] = mi.load_dict(integrator)
 
 
 def medium(spec: MediumSpec, mm_per_unit: float) -> mi.Medium:

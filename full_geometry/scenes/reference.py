@@ -195,7 +195,11 @@ def _in_passes(
     resume: bool | str | os.PathLike[str], progress: Progress | None, denoise: Denoise | None,
 ) -> Reference:  # fmt: skip
     """Take passes until a limit is reached, and write the file now and then and at the end."""
-    result = _start(path, resume, about)
+    result = None
+    if resume is not False and (resume is not True or path.exists()):
+        before = path if resume is True else Path(resume)
+        result = load(before)
+        check_same(result, before, about)
     if denoise is not None and result is not None and result.half is None:
         raise ValueError(f"{path} must hold the halves of a denoised render to go on with it, got none; delete it")
     if denoise is None and result is not None:
@@ -385,17 +389,6 @@ def chosen(scene: mi.Scene, integrator: mi.Integrator) -> dict[str, Any]:
     integrator.prepare(scene)
     result = integrator.choices
     return {"choices": result.sentences, "chosen": [result.light, *result.models.values()]}
-
-
-def _start(path: Path, resume: bool | str | os.PathLike[str], about: dict[str, Any]) -> Reference | None:
-    """The render to go on with, if there is one.
-    ValueError if it is damaged or of another render."""
-    if resume is False or (resume is True and not path.exists()):
-        return None
-    path = path if resume is True else Path(resume)
-    result = load(path)
-    check_same(result, path, about)
-    return result
 
 
 def check_same(reference: Reference, path: Path, about: dict[str, Any]) -> None:

@@ -83,19 +83,16 @@ class MediumDerivatives:
             if wanted and textured:
                 raise ValueError("g must not have gradients enabled under models of objects with textures, got them")
             if wanted and transport is not None and name not in self._stencils:
-                self._stencils[name] = self._stencil(name, transport)
+                places = [self._places(name, m) for m in self.spec.channels()]
+                sides = [transport.transport.perturbed(media) for media in zip(*(media for media, _ in places))]
+                columns = zip(*(coefficients for _, coefficients in places))
+                self._stencils[name] = Stencil(sides, [mi.Spectrum([opaque(c) for c in column]) for column in columns])
 
     def check(self, names: Iterable[str]) -> None:
         """ValueError if the model has no derivative by one of the parameters."""
         for name in names:
             for m in self.spec.channels():
                 self._places(name, m)
-
-    def _stencil(self, name: str, transport: DifferentiableTransport) -> Stencil:
-        places = [self._places(name, m) for m in self.spec.channels()]
-        sides = [transport.transport.perturbed(media) for media in zip(*(media for media, _ in places))]
-        columns = zip(*(coefficients for _, coefficients in places))
-        return Stencil(sides, [mi.Spectrum([opaque(c) for c in column]) for column in columns])
 
     def _places(self, name: str, m: Medium) -> tuple[list[Medium], list[float]]:
         """The media of a channel on both sides, 1/(scene unit), and the coefficients."""

@@ -212,7 +212,8 @@ class TexturedMedium:
         for name, texture in self.textures.items():
             values, hint = texels(texture), ""
             if obj is not None:
-                if _by_uv(texture) and obj.shape.is_mesh() and not obj.shape.has_vertex_texcoords():
+                by_uv = any(kind_of(node) in BY_UV for node in mi.traverse(texture).hierarchy)
+                if by_uv and obj.shape.is_mesh() and not obj.shape.has_vertex_texcoords():
                     raise ValueError(f"object {obj.name} must have uv for the texture {name}, got a mesh without")
                 values = attributes(name, texture, obj.shape)
                 hint = (
@@ -330,10 +331,6 @@ def shown(texture: mi.Texture) -> list[tuple[mi.Object, str]]:
 def kind_of(node: mi.Object) -> str:
     """The class of a texture, without what Mitsuba appends to it."""
     return node.class_name().partition("Impl")[0]
-
-
-def _by_uv(texture: mi.Texture) -> bool:
-    return any(kind_of(node) in BY_UV for node in mi.traverse(texture).hierarchy)
 
 
 def _values_on(name: str, texture: mi.Texture, shape: mi.Shape) -> np.ndarray:

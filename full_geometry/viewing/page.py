@@ -265,7 +265,9 @@ class MediumControls:
     def show(self, medium: Medium) -> None:
         """Bring the sliders to a medium."""
         self.paths: np.ndarray = np.broadcast_to(1 / np.maximum(medium.sigma_t, 1e-9), 3)
-        self.handles["reflectance"].value = _encoded(np.broadcast_to(medium.reflectance(), 3))
+        self.handles["reflectance"].value = tuple(
+            np.round(255 * srgb(np.broadcast_to(np.maximum(medium.reflectance(), 0), 3))).astype(int).tolist()
+        )
         self.handles["stops"].value, self.handles["eta"].value = 0.0, float(np.clip(medium.eta, 1.0, 2.0))
         self.handles["g"].value = float(np.clip(np.mean(medium.g), -0.9, 0.99))
 
@@ -286,19 +288,10 @@ class MediumControls:
         if name not in (AS_THEY_ARE, OWN):
             return {"material": name, **alpha}
         values = {
-            "reflectance": _decoded(said["reflectance"]),
+            "reflectance": tuple(linear_of_srgb(np.array(said["reflectance"]) / 255).tolist()),
             "mfp": tuple((2 ** said["stops"] * self.paths).tolist()),
         }
         return {**values, "g": said["g"], "eta": said["eta"], **alpha}
-
-
-def _encoded(R: np.ndarray) -> tuple[int, int, int]:
-    """A linear colour as a picker has it."""
-    return tuple(np.round(255 * srgb(np.maximum(R, 0))).astype(int).tolist())
-
-
-def _decoded(colour: tuple[int, int, int]) -> tuple[float, ...]:
-    return tuple(linear_of_srgb(np.array(colour) / 255).tolist())
 
 
 # ---- Ports, and who may connect -------------------------------------------------------------------------------------

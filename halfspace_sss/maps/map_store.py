@@ -43,23 +43,8 @@ def unit_checksum(S: np.ndarray, variance: np.ndarray) -> int:
     return (1 << 32) | zlib.crc32(data[1], zlib.crc32(data[0]))
 
 
-def written_checksums(dataset: xr.Dataset) -> dict[str, str | int]:
-    """Attributes: of every coordinate, in float64, and of the attribute `ASKED`."""
-    coordinates = json.dumps(_coordinates(dataset), sort_keys=True)
-    return {COORDINATES: coordinates, ATTRIBUTE: zlib.crc32(dataset.attrs[ASKED].encode())}
-
-
-def check_written(dataset: xr.Dataset) -> None:
-    """ValueError names what is not as it was written."""
-    if dataset.attrs[ATTRIBUTE] != zlib.crc32(dataset.attrs[ASKED].encode()):
-        raise ValueError(f"attribute {ASKED} does not match its checksum")
-    written, result = json.loads(dataset.attrs[COORDINATES]), _coordinates(dataset)
-    for name in sorted(written.keys() | result.keys()):
-        if written.get(name) != result.get(name):
-            raise ValueError(f"coordinate {name} does not match its checksum")
-
-
 def _coordinates(dataset: xr.Dataset) -> dict[str, int]:
+    """Checksums of the coordinates, in float64."""
     return {str(name): zlib.crc32(np.asarray(c.values, "<f8").tobytes()) for name, c in dataset.coords.items()}
 
 
@@ -212,7 +197,8 @@ def _create(path: Path, medium: Medium, grid: MapGrid, seed: int, asked: JsonDic
 
     dataset, memory = _template(medium, grid, seed), {}
     dataset.attrs |= {ASKED: json.dumps(asked, sort_keys=True), "provenance": json.dumps(provenance())}
-    dataset.attrs |= written_checksums(dataset)
+    dataset.attrs[COORDINATES] = json.dumps(_coordinates(dataset), sort_keys=True)
+    dataset.attrs[ATTRIBUTE] = zlib.crc32(dataset.attrs[ASKED].encode())
     key = "compressor" if zarr.__version__ < "3" else "compressors"  # version 2 is the last one for Python 3.10
     kinds = {name: {key: Zstd(checksum=True)} for name in dataset.variables}
     for name in dataset.data_vars:
@@ -254,7 +240,12 @@ def _open(path: Path) -> xr.Dataset:
         missing = {*DATA, "checksum", "n_paths", "n_events"} - set(dataset.data_vars)
         if missing:
             raise KeyError(f"arrays {', '.join(sorted(missing))}")
-        check_written(dataset)
+        if dataset.attrs[ATTRIBUTE] != zlib.crc32(dataset.attrs[ASKED].encode()):
+            raise ValueError(f"attribute {ASKED} does not match its checksum")
+        written, result = json.loads(dataset.attrs[COORDINATES]), _coordinates(dataset)
+        for name in sorted(written.keys() | result.keys()):
+            if written.get(name) != result.get(name):
+                raise ValueError(f"coordinate {name} does not match its checksum")
     except Exception as error:  # zarr, JSON and xarray each raise their own kinds
         raise ValueError(f"map store {path} is damaged or not a map store: {error}") from error
     if asked.get("format") != FORMAT:

@@ -93,7 +93,8 @@ def _own() -> Iterator[tuple[str, Material]]:
 
 
 def _of_user() -> Iterator[tuple[str, Material]]:
-    folder = _user_folder()
+    variable, default = ("APPDATA", "AppData/Roaming") if os.name == "nt" else ("XDG_CONFIG_HOME", ".config")
+    folder = Path(os.environ.get(variable) or Path.home() / default) / "halfspace-sss" / "materials"
     if folder.is_dir():
         yield from _from_path(folder)
     for path in os.environ.get(ENVIRONMENT_VARIABLE, "").split(os.pathsep):
@@ -101,11 +102,6 @@ def _of_user() -> Iterator[tuple[str, Material]]:
             if not Path(path).exists():
                 raise ValueError(f"{ENVIRONMENT_VARIABLE} must list existing folders or files, got {path!r}")
             yield from _from_path(path)
-
-
-def _user_folder() -> Path:
-    variable, default = ("APPDATA", "AppData/Roaming") if os.name == "nt" else ("XDG_CONFIG_HOME", ".config")
-    return Path(os.environ.get(variable) or Path.home() / default) / "halfspace-sss" / "materials"
 
 
 def _from_path(path: str | os.PathLike[str]) -> Iterator[tuple[str, Material]]:

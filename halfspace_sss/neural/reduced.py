@@ -64,7 +64,8 @@ class ReducedNetworks:
         for m in models:
             check_numbers("medium", m.medium)
         q = _queries(max(_length(m) for m in models), models[0].medium.eta)
-        wanted = np.stack([_log_factor(m, q) for m in models])
+        learnt = (m.networks[0](_features(q, _length(m))) + log_calibrations(m.calibrations[0], q) for m in models)
+        wanted = np.stack(list(learnt))
         weights = _weights(models, q, wanted)
         kept = [models[round(place * (len(models) - 1))] for place in PLACES]
         columns = [_hidden(m.networks[0], np.stack(_features(q, _length(m)), axis=1)) for m in kept]
@@ -111,10 +112,6 @@ def _queries(longest: float, eta: float) -> Query:
     mu_i, mu_o = np.sqrt(u[1:3])
     phi_i, phi_o = 2 * np.pi * u[3:] - np.pi
     return Query(library(r), r, mu_i, phi_i, mu_o, phi_o, eta)
-
-
-def _log_factor(model: SymmetricModel, q: Query) -> np.ndarray:
-    return model.networks[0](_features(q, _length(model))) + log_calibrations(model.calibrations[0], q)
 
 
 def _weights(models: Sequence[SymmetricModel], q: Query, log_factors: np.ndarray) -> np.ndarray:

@@ -142,15 +142,12 @@ def load_hypernetwork(path: Path) -> Hypernetwork:
 
 def hypernetwork_of(arrays: Mapping[str, np.ndarray], width: int, depth: int) -> Hypernetwork:
     """The network of arrays by name, as they stand in a file of weights."""
-    medium, calibration = (
-        tuple((arrays[f"{name}_{k}_W"], arrays[f"{name}_{k}_b"]) for k in range(_count(arrays, name)))
-        for name in ("medium", CALIBRATION)
-    )
+    layers: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {"medium": [], CALIBRATION: []}
+    for name, pairs in layers.items():
+        while f"{name}_{len(pairs)}_b" in arrays:
+            pairs.append((arrays[f"{name}_{len(pairs)}_W"], arrays[f"{name}_{len(pairs)}_b"]))
+    medium, calibration = map(tuple, layers.values())
     return Hypernetwork(medium, arrays["base"], arrays["basis"], width, depth, calibration)
-
-
-def _count(arrays: Mapping[str, np.ndarray], name: str) -> int:
-    return sum(key.startswith(f"{name}_") and key.endswith("_b") for key in arrays)
 
 
 def _sizes(arrays: Mapping[str, np.ndarray], name: str) -> list[int]:

@@ -306,13 +306,6 @@ class Pass:
         return sums.result() * (self.T_i[0] * sums.batches / self.n_paths)
 
 
-def _incidence(mu_i: float | str, lanes: int, rng: np.random.Generator) -> np.ndarray:
-    """Outside cosine of each lane; diffuse light is stratified over lanes by its cosine."""
-    if mu_i == "diffuse":
-        return np.sqrt((np.arange(lanes) + rng.random(lanes)) / lanes)
-    return np.full(lanes, float(mu_i))
-
-
 def walk_passes(
     types: ModuleType,
     medium: Medium | Layers,
@@ -335,7 +328,9 @@ def walk_passes(
     """
     lanes, per_lane, passes = launch_shape(n_paths, dr.backend_v(types.Float) == dr.JitBackend.CUDA)
     for done in range(1, passes + 1):
-        mu, recorded = _incidence(mu_i, lanes, np.random.default_rng([*seed, done])), tallies()
+        # outside cosine of each lane; diffuse light is stratified over lanes by its cosine
+        u, recorded = np.random.default_rng([*seed, done]).random(lanes), tallies()
+        mu = np.sqrt((np.arange(lanes) + u) / lanes) if mu_i == "diffuse" else np.full(lanes, float(mu_i))
         mu_in = aligned(types.Float, mu_internal(mu, medium.eta))
         sums, events = trace(types, medium, mu_in, per_lane, pass_seed(*seed, done), recorded)
         if progress:

@@ -14,7 +14,7 @@ import torch
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.comparison.model_errors import ModelError, ReferenceSize, model_error, reference_maps
-from halfspace_sss.maps.noisy_maps import CellGrid, Groups, draw_directions, make_pool
+from halfspace_sss.maps.noisy_maps import CellGrid, draw_directions, make_pool
 from halfspace_sss.materials import load
 from halfspace_sss.neural import material_model, paper_model
 from halfspace_sss.neural.material_model import network_arrays
@@ -165,7 +165,8 @@ def train_channel(
     if place:
         what = {"model": training.kind, **vars(training)}
         claim(place, medium=_ratios(medium), training=what, recipe=asdict(recipe), seed=seed, backend=backend)
-    groups = _groups(medium, recipe.n_groups, np.random.default_rng([seed, 0]))
+    ratios = (np.full(recipe.n_groups, float(v)) for v in _ratios(medium).values())
+    groups = draw_directions(*ratios, np.random.default_rng([seed, 0]))
     halves = make_pool(groups, recipe.grid, recipe.events, (seed, 1), place, progress, backend)
     pool = MapPool(groups, recipe.grid, halves)
     check = (VALIDATION_SEED, seed)
@@ -197,11 +198,6 @@ def train_channel(
 
 def _ratios(medium: Medium) -> dict[str, float]:
     return {"albedo": float(medium.albedo), "g": float(medium.g), "eta": medium.eta}
-
-
-def _groups(medium: Medium, n: int, rng: np.random.Generator) -> Groups:
-    one = np.ones(n)
-    return draw_directions(float(medium.albedo) * one, float(medium.g) * one, medium.eta * one, rng)
 
 
 def _record(
