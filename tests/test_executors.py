@@ -109,13 +109,10 @@ def test_two_processes_share_the_cores_and_give_the_bits_of_one(tmp_path: Path) 
 
 
 @pytest.mark.slow
-def test_workers_of_dask_give_the_bits_of_one_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    here = make_maps(MEDIA, tmp_path / "here", **HOW)
+def test_workers_of_dask_are_refused_with_more_threads_or_another_version(monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[str] = []
-    with executors.scheduler("local", said.append) as executor:
-        there = make_maps(MEDIA, tmp_path / "there", executor=executor, **HOW)
-    for name in MEDIA:
-        assert load_maps(there[name]).S.equals(load_maps(here[name]).S)
+    with executors.scheduler("local", said.append):
+        pass
     assert re.fullmatch(r"dashboard of Dask: http://127\.0\.0\.1:\d+/status", *said)
     with dask(threads=2) as address:
         with pytest.raises(ValueError, match="must run one part at a time .* got 2 threads"):

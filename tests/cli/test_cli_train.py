@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from pathlib import Path
 from typing import Any
@@ -83,7 +84,9 @@ def test_every_channel_of_every_material_has_its_row_and_weights() -> None:
 
 
 @pytest.mark.slow
-def test_the_network_of_the_paper_is_trained_by_name() -> None:
+def test_the_network_of_the_paper_is_trained_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    narrow = functools.partial(train_material.PaperLearner, width=32)
+    monkeypatch.setattr(train_material, "PaperLearner", narrow)
     assert _invoke("train", "material", "--model", "neural_paper", "--steps", "2").exit_code == 0
     (path,) = _weights()
     assert load_weights(path, "neural_paper")[1]["recipe"]["how"]["steps"] == 2

@@ -5,9 +5,7 @@ Means of walks are compared at four standard errors.
 
 from __future__ import annotations
 
-import errno
 import json
-import os
 import re
 import shutil
 from pathlib import Path
@@ -25,7 +23,7 @@ import drjit as dr  # noqa: E402
 import full_geometry  # noqa: E402
 from figures import app as cli  # noqa: E402
 from full_geometry.geometry.points import SurfacePoint  # noqa: E402
-from full_geometry.learning import online, training  # noqa: E402
+from full_geometry.learning import training  # noqa: E402
 from full_geometry.learning.network_fitting import Recipe  # noqa: E402
 from full_geometry.learning.online import combined  # noqa: E402
 from full_geometry.learning.training import CameraSchedule  # noqa: E402
@@ -166,23 +164,6 @@ def _same_image(whole: Path) -> None:
     assert np.allclose(found.mean, wanted.mean, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.slow
-def test_a_disk_that_fills_up_while_learning_leaves_no_half_weights_and_work_to_go_on_from() -> None:
-    sync = os.fsync
-
-    def full(handle: int) -> None:
-        if os.readlink(f"/proc/self/fd/{handle}").count("full_geometry-"):
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        sync(handle)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(os, "fsync", full)
-        result = _render()
-    assert result.exit_code == 1 and "No space left on device" in result.stderr
-    assert not _weights() and not IMAGE.exists()
-    assert _render("--resume").exit_code == 0 and IMAGE.exists() and _weights()
-
-
 def test_a_folder_of_weights_that_cannot_be_written_to_is_refused_before_anything_is_traced(monkeypatch: Any) -> None:
     Path("weights").write_text("")
     _refused(monkeypatch, "folder must be a folder or new", _render())
@@ -212,13 +193,6 @@ def test_what_cannot_be_learnt_is_refused_before_anything_is_traced(
     monkeypatch.setattr(training, "train", None)
     monkeypatch.setattr(camera_walks.CameraWalks, "exits", None)
     _refused(monkeypatch, message, _render(*arguments))
-
-
-def test_a_black_scene_is_learnt_and_stays_black(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(training, "train", lambda *a, **how: TRAIN(*a, **{**how, "recipe": QUICK, "chunks": 1}))
-    Path("ball.xml").write_text(XML.replace('<emitter type="constant"/>', ""))
-    result = _render()
-    assert result.exit_code == 0 and "every pixel is black" in result.stdout and _weights()
 
 
 @pytest.mark.slow
@@ -304,12 +278,3 @@ def test_the_combination_of_two_images_is_not_biased_and_has_less_variance_than_
     together, *alone = np.mean(variances, axis=0)
     assert together < 0.9 * min(alone)
     assert found.spp == 40 and found.passes == 10
-
-
-@pytest.mark.slow
-def test_the_library_function_renders_what_the_command_does(whole: Path) -> None:
-    said: list[str] = []
-    IMAGE.parent.mkdir()
-    online.render("ball.xml", IMAGE, train_seconds=60.0, spp=8, listeners=online.Listeners(told=said.append))
-    assert len(said) == 1
-    _same_image(whole)

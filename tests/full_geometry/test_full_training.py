@@ -179,26 +179,6 @@ def test_S_is_positive_and_finite(trained: Trained) -> None:
     assert np.all(np.isfinite(S)) and np.all(S >= 0) and np.mean(S > 0) > 0.9
 
 
-@pytest.mark.slow
-def test_a_killed_run_ends_with_the_same_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    arguments = {"chunks": 3, "recipe": QUICK, "seed": 3}
-    shape = mi.load_dict(bunny())
-    whole = train(shape, WAX, folder=tmp_path / "a", work=tmp_path / "whole", **arguments)
-    monkeypatch.setattr(training, "CHECKPOINT_EVERY", 0.0)
-
-    def kill(what: str, done: int, total: int) -> None:
-        if done == 2:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train(shape, WAX, folder=tmp_path / "b", work=tmp_path / "killed", progress=kill, **arguments)
-    again = train(shape, WAX, folder=tmp_path / "b", work=tmp_path / "killed", **arguments)
-    assert again.steps == whole.steps
-    for one, other in ((whole.model, again.model), (whole.model.alpha, again.model.alpha)):
-        assert all(np.array_equal(v, other.weights[name]) for name, v in one.weights.items())
-    assert all(np.array_equal(v, again.sampler.weights[name]) for name, v in whole.sampler.weights.items())
-
-
 def test_work_of_another_object_is_refused(trained: Trained) -> None:
     folder = trained.path.parents[1]
     with pytest.raises(ValueError, match="size_in_mfp"):

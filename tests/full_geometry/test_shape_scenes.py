@@ -64,19 +64,6 @@ def test_it_is_listed_with_the_transports() -> None:
     assert "neural_shape" in model_names() and not lookup("neural_shape").capabilities.of_half_space
 
 
-def test_a_render_of_an_object_that_nobody_trained_is_nearer_to_walks_than_the_half_space() -> None:
-    truth = image(scene(orders="multiple", reflection=False), "path_traced", 1024).mean()
-    found = image(scene(orders="multiple", reflection=False)).mean()
-    plane = image(scene(orders="multiple", reflection=False, model="neural")).mean()
-    assert abs(found - truth) < 0.4 * abs(plane - truth)
-
-
-def test_channels_differ_as_their_media_do() -> None:
-    colours = {"sigma_s": "0.99, 0.9, 0.5", "sigma_a": "0.01, 0.1, 0.5"}
-    each = image(scene(orders="multiple", reflection=False, **colours))[2:6, 2:6].mean(axis=(0, 1))
-    assert np.isfinite(each).all() and each[0] > 1.2 * each[1] > 1.2 * each[2] > 0
-
-
 @pytest.fixture
 def uncalibrated(monkeypatch: pytest.MonkeyPatch) -> None:
     """No walks for the light that leaves, which warnings come before."""

@@ -102,7 +102,7 @@ def test_a_store_has_a_channel_for_each_of_a_medium(tmp_path):
 SCRIPT = """
 from halfspace_sss import Medium, make_maps
 from halfspace_sss.maps.grid import MapGrid
-make_maps({"m": Medium.from_albedo(0.75, 1.0)}, %r, grid=MapGrid(6, 16, 10, 8), target_error=None, n_paths=1_000_000,
+make_maps({"m": Medium.from_albedo(0.75, 1.0)}, %r, grid=MapGrid(6, 16, 10, 8), target_error=None, n_paths=300_000,
           progress=lambda *a: print(*a, flush=True))
 """
 

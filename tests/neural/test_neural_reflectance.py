@@ -18,9 +18,9 @@ from halfspace_sss.physics.fresnel import F_r, mu_internal
 
 POINTS, RING_POINTS = 2**13, 2**16
 WITHIN = 0.015  # of every reflectance
-TRACED = [
-    (0.5, 0.0, 1.0), (0.75, 0.5, 0.5), (0.9, 0.9, 1.0), (0.95, -0.4, 0.5), (0.97, 0.8, 0.5), (0.99, 0.5, 0.5),
-    (0.9, 0.0, 1.0), (0.8, 0.3, 1.0),
+TRACED = [  # albedo, g, mu_i, eta
+    (0.5, 0.0, 1.0, 1.4), (0.75, 0.5, 0.5, 1.0), (0.9, 0.9, 1.0, 1.1), (0.95, -0.4, 0.5, 1.4), (0.97, 0.8, 0.5, 1.0),
+    (0.99, 0.5, 0.5, 1.4), (0.9, 0.0, 1.0, 1.0), (0.8, 0.3, 1.0, 1.4),
 ]  # fmt: skip
 COUNTS = 0.005  # share of the light that a ring must have to count
 
@@ -83,7 +83,7 @@ def test_radial_profiles_of_the_table_are_met() -> None:
 @pytest.mark.slow
 def test_radial_profiles_of_walks_are_met_also_where_the_boundary_is_matched() -> None:
     off = []
-    for albedo, g, mu_i, eta in [(*ratios, eta) for ratios in TRACED for eta in (1.0 if ratios[1] < 0.9 else 1.1, 1.4)]:
+    for albedo, g, mu_i, eta in TRACED:
         medium = Medium.from_albedo(albedo, 1.0, g, eta)
         L = 1 / math.sqrt(3 * (1 - albedo) * (1 - albedo * g))
         edges = np.concatenate([[0.0], np.geomspace(0.02, 20, 13)]) * max(L, 0.3)
@@ -92,7 +92,7 @@ def test_radial_profiles_of_walks_are_met_also_where_the_boundary_is_matched() -
         multiple, total = (walks.exitance(order).value * area for order in ("multiple", "total"))
         counts = multiple > COUNTS * walks.reflectance("multiple").value
         off += (np.abs(_rings(medium, mu_i, edges) - multiple) / total)[counts].tolist()
-    assert len(off) > 100 and np.median(off) < 0.01 and np.quantile(off, 0.9) < 0.03
+    assert len(off) > 50 and np.median(off) < 0.01 and np.quantile(off, 0.9) < 0.03
 
 
 STEEP, MATCHED = [(g, eta) for g in (0.9, 0.98) for eta in (1.1, 1.5, 2.0)], [1.0, 1.02, 1.1, 1.5, 2.0]
@@ -110,7 +110,7 @@ DAILY_CORNERS = [
 
 
 @pytest.mark.parametrize(
-    "corners", [pytest.param(DAILY_CORNERS, id="some"), pytest.param(CORNERS, id="all", marks=pytest.mark.slow)]
+    "corners", [pytest.param(DAILY_CORNERS, id="some"), pytest.param(CORNERS[::4], id="more", marks=pytest.mark.slow)]
 )
 def test_reflectances_of_the_corners_of_the_range_are_met_within_1_5_percent_and_none_is_above_1(corners) -> None:
     """At albedo 1, g 0.98 it was 0.76 to 2.3 times the exact one for eta 1 to 1.05, 3 to 6 % off for larger ones."""

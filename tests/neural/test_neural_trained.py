@@ -183,15 +183,6 @@ def test_every_channel_must_be_trained(fig10: TrainedChannel, folder: Path, look
         halfspace_sss.bssrdf("neural_material", MEDIUM)
 
 
-def test_training_a_coloured_medium_trains_its_channels(tmp_path: Path, look_in: Any) -> None:
-    results = train(MEDIUM, recipe=TINY, folder=tmp_path, work=tmp_path / "work")
-    assert [float(r.medium.albedo) for r in results] == [0.75, 0.9]
-    assert sorted(path.name for path in (tmp_path / "work").iterdir()) == ["channel-0", "channel-1"]
-    look_in(tmp_path)
-    model = halfspace_sss.bssrdf("neural_material", MEDIUM)
-    assert model.eval(1.0, 1.0, 0.0, 1.0, 0.0).shape == (2,)
-
-
 def test_weights_lie_in_the_folder_of_the_user_unless_another_is_named(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.delenv(store.ENVIRONMENT_VARIABLE, raising=False)
     for variable in ("XDG_DATA_HOME", "LOCALAPPDATA"):
