@@ -25,6 +25,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a shell starts what 
 import numpy as np
 import pytest
 import quick_kernels
+import quick_light
 import typer.testing
 
 import halfspace_sss
@@ -172,6 +173,12 @@ def quiet_rgb(rgb: None):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
+
+
+@pytest.fixture
+def little_light(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Light is gathered, corrected and precomputed by few samples."""
+    quick_light.gather_by_few(monkeypatch.setattr)
 
 
 @pytest.fixture

@@ -99,7 +99,7 @@ SQUARED = [v for v in VARIANTS if v.learned == "S"]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("variant", RELATIVE, ids=[v.name for v in RELATIVE])
+@pytest.mark.parametrize("variant", RELATIVE[-2:], ids=[v.name for v in RELATIVE[-2:]])
 def test_a_variant_lowers_its_error_against_its_start(variant: Variant, pool: MapPool, reference: TracedMaps) -> None:
     def error(learner: Any) -> float:
         return model_error(model_of(learner, reference.medium), reference).error

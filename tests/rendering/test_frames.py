@@ -22,7 +22,7 @@ ORBIT = [[0, 0, 40, 0, 0, 0, 0, 1, 0], [4, 0, 40, 0, 0, 0, 0, 1, 0]]
 
 
 @pytest.fixture
-def dim(quiet_rgb: None) -> dict:
+def dim(quiet_rgb: None, little_light: None) -> dict:
     """A cube beside a lamp, in gathered light."""
     medium = {"type": "translucent", "sigma_s": 2.0, "sigma_a": 0.2, "model": "better_dipole"}
     lens = {"to_world": mi.ScalarTransform4f().look_at([0, 0, 9], [0, 0, 0], [0, 1, 0]), "fov": 25.0}

@@ -48,12 +48,12 @@ def _known(lights: str, hide: bool) -> np.ndarray:
     return _image({"type": "path"}, LIGHTS[lights](), hide, 256)
 
 
-CASES = [  # gathering takes longest: emitters are hidden in one light and shown in the other
+CASES = [  # gathering takes longest: the emitters of one light are hidden
     pytest.param(kind, lights, hide, id=f"{kind}-{lights}-{'hidden' if hide else 'shown'}")
     for kind in INTEGRATORS
     for lights in LIGHTS
     for hide in (True, False)
-    if kind != "gathered" or hide == (lights == "lamps")
+    if kind != "gathered" or (lights, hide) == ("lamps", True)
 ]
 
 

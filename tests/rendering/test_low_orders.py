@@ -55,7 +55,6 @@ def _pair(surface: dict, light: dict | None, shape: str, spp: tuple[int, int], r
 
 CASES = {
     "bright sphere, sky": ("sphere", BRIGHT, None),
-    "dark sphere, lamp": ("sphere", DARK, "lamp"),
     "bright slab, lamp": ("slab", BRIGHT, "lamp"),
     "dark slab, sky": ("slab", DARK, None),
     "bright bunny, sky": ("bunny", BRIGHT, None),

@@ -13,6 +13,8 @@ import halfspace_sss
 mi = pytest.importorskip("mitsuba")
 import drjit as dr  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("little_light")
+
 
 @pytest.fixture(autouse=True)
 def _variant():

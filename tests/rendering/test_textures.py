@@ -66,15 +66,19 @@ def test_a_white_texture_without_absorption_is_invisible_in_uniform_light() -> N
     np.testing.assert_allclose(image, 1, rtol=1e-5)
 
 
-@pytest.mark.parametrize("model", ["better_dipole", "standard_dipole", pytest.param("neural", marks=pytest.mark.slow)])
-def test_a_white_texture_sends_the_energy_of_the_model(model: str) -> None:
+def test_a_white_texture_sends_the_energy_of_the_model() -> None:
     """To 0.5 %: along the normal under even light F_r(1) + R(1) of the half-space, as these models are reciprocal.
 
     Half of the texels absorb as little as float32 has it, so that the texture is one: 0.2 % by the exact reflectance.
     """
     half, at = 400.0, mi.ScalarTransform4f()
     view = at.look_at([0, 0, 2 * half], [0, 0, 0], [0, 1, 0]) @ at.scale([0.25 * half, 0.25 * half, 1])
-    white = {"albedo": _texels("1,1,1", "0.9999999,0.9999999,0.9999999"), "sigma_t": 1.0, "eta": 1.4, "model": model}
+    white = {
+        "albedo": _texels("1,1,1", "0.9999999,0.9999999,0.9999999"),
+        "sigma_t": 1.0,
+        "eta": 1.4,
+        "model": "better_dipole",
+    }
     scene = {
         "type": "scene",
         "integrator": {"type": "bssrdf"},
@@ -85,7 +89,7 @@ def test_a_white_texture_sends_the_energy_of_the_model(model: str) -> None:
     image = mi.render(mi.load_dict(scene), spp=256, seed=1).numpy()
     media = [Medium.from_albedo(albedo, 1.0, 0.0, 1.4) for albedo in (1.0, float(np.float32(0.9999999)))]
     assert 1 - media[1].reflectance(1.0) / media[0].reflectance(1.0) < 2e-3
-    own = np.mean([measure.reflectance(bssrdf(model, m), 1.0, "total") for m in media])
+    own = np.mean([measure.reflectance(bssrdf("better_dipole", m), 1.0, "total") for m in media])
     assert image.mean() == pytest.approx(float(own) + (0.4 / 2.4) ** 2, rel=5e-3)
 
 
@@ -129,7 +133,7 @@ def test_models_of_one_texel_are_those_of_its_medium(model: str) -> None:
     assert np.array_equal(painted, plain)
 
 
-@pytest.mark.parametrize("model", TAKING)
+@pytest.mark.parametrize("model", ["better_dipole", pytest.param("neural", marks=pytest.mark.slow)])
 def test_models_between_nodes_are_those_of_the_medium(model: str) -> None:
     """With other texels beside, to 0.5 %, by reduced networks to 2.5 %: ln S is nearly linear in v."""
     medium = {**PLAIN, "albedo": "0.96,0.83,0.65"}
@@ -137,7 +141,7 @@ def test_models_between_nodes_are_those_of_the_medium(model: str) -> None:
     (plain, painted) = _transports(model, medium, _painted(medium, beside))
     a, b = _S(plain), _S(painted)
     upper = np.random.default_rng(1).normal(size=(3, 512))[1] > 0.5  # both ends are in the first texel
-    assert np.abs(a - b)[upper].sum() < (0.025 if model == "neural" else 0.005) * a[upper].sum() or model == "lambert"
+    assert np.abs(a - b)[upper].sum() < (0.025 if model == "neural" else 0.005) * a[upper].sum()
     assert np.abs(a - b).sum() > 0.05 * a.sum()
 
 

@@ -72,8 +72,8 @@ def _mean(scene: mi.Scene, name: str, at: np.ndarray, seed: int, spp: int) -> np
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("light", "key", "change", "spp", "known_to"),
-    [("sky", "albedo", -0.3, 96, 0.02), ("sky", "sigma_t", 0.2, 192, 0.02), ("point", "albedo", -0.2, 48, 0.1),
-     ("point", "g", -0.6, 48, 0.25), ("lamp", "sigma_t", 0.2, 96, 0.1), ("lamp", "g", 0.5, 96, 0.1),
+    [("sky", "sigma_t", 0.2, 192, 0.02), ("point", "albedo", -0.2, 48, 0.1),
+     ("point", "g", -0.6, 48, 0.25), ("lamp", "sigma_t", 0.2, 96, 0.1),
      ("sky", "albedo.data", np.array([[[-0.3], [-0.1]]]), 96, 0.03)],
 )  # fmt: skip
 def test_derivatives_by_the_medium_add_up_to_the_difference_of_images(
@@ -163,15 +163,11 @@ def _gradients(scene: mi.Scene, endings: tuple[str, ...], seed: int = 3, spp: in
     return np.array([np.sum(each, axis=0) for each in slopes])
 
 
-@pytest.mark.parametrize(("key", "ending"), [("albedo", "data"), ("sigma_t", "vertex_color")])
-def test_derivatives_by_texels_and_vertices_add_up_to_those_by_a_constant(
-    key: str, ending: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_derivatives_by_vertices_add_up_to_those_by_a_constant(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the same paths: kernels differ by rounding, by which few paths take another way."""
     monkeypatch.setattr(scores, "SLOTS", 8)
-    names = (key, "sigma_t" if key == "albedo" else "albedo", "g")
-    constant = _gradients(_plates(None, key), tuple(f".{name}" for name in names))
-    painted = _gradients(_plates(ending, key), (f".{ending}", *(f".{name}" for name in names[1:])))
+    constant = _gradients(_plates(None, "sigma_t"), (".sigma_t", ".albedo", ".g"))
+    painted = _gradients(_plates("vertex_color", "sigma_t"), (".vertex_color", ".albedo", ".g"))
     assert painted == pytest.approx(constant, rel=2e-3)
 
 
