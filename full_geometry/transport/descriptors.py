@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.geometry.points import SurfacePoint, floats, opaque, refract_in
+from full_geometry.geometry.points import SurfacePoint, floats, local_frame, opaque, refract_in
 from full_geometry.objects.objects import TranslucentObject
 from full_geometry.transport.features import FirstEvent, first_event
 from halfspace_sss.neural.network import medium_features
@@ -37,10 +37,8 @@ from halfspace_sss.tracing.walk import generator, pass_seed
 #     M = [a² (q - q_d)/sigma_t + a q k² a'² q'/(1 - a' q')/sigma_t'] / (4 pi V eta²).
 #
 # It holds in what is thin and flat or rugged; in a smooth ball it is up to twice too much, as light that entered does
-# not
-# reach what is held near the surface. M is divided by 1 + (sigma_t' c)², as light of thick objects leaves near where it
-# entered. m_2 = a²/(4 pi eta)² is that of light of two events, see `neural_shape.Backbone`.
-
+# not reach what is held near the surface. M is divided by 1 + (sigma_t' c)², as light of thick objects leaves near
+# where it entered. m_2 = a²/(4 pi eta)² is that of light of two events, see `Backbone`.
 
 POINTS, SEED = 2**15, 31
 LEAST_ESCAPE = 1e-6
@@ -150,8 +148,8 @@ def phases(g: float, d_o: mi.Vector3f, d_i: mi.Vector3f, d: mi.Vector3f) -> mi.F
 # For lengths l_k, a mean free path and multiples of a transport mean free path, with c_j the chance 1 - exp(-d_j/l_k)
 # that something happens on the way, and c'_j that on the way z/(omega_j.n) to a plane (1 downwards),
 #
-#     L_k = log[(mean_j c_j + e)/(mean_j c'_j + e)] / 2,    V_k = mean_j omega_j c'_j / (mean_j c'_j + e) - the same of
-# c.
+#     L_k = log[(mean_j c_j + e)/(mean_j c'_j + e)] / 2,
+#     V_k = mean_j omega_j c'_j / (mean_j c'_j + e) - the same of c.
 #
 # Both are 0 on a half-space, and tell thin from thinner however thin it is. A mesh is looked at by rays only, so its
 # resolution does not count.
@@ -161,7 +159,6 @@ LENGTHS = (2.0, 8.0, 32.0)  # transport mean free paths
 N_LENGTHS = 1 + len(LENGTHS)
 LEAST_CHANCE = 1e-4  # e
 FAR = 1e30
-LEAST_SINE2 = 1e-8  # below it w has no azimuth
 
 
 class RaySurroundings(NamedTuple):
@@ -198,7 +195,7 @@ def _from(
     tables = [floats(row) for row in directions()]
     sigma_t, sigma_t_prime = extinctions
     decays = [opaque(v) for v in (sigma_t, *(sigma_t_prime / length for length in LENGTHS))]
-    n, (t, b) = at.n_out, _tangents(at)
+    t, b, n = local_frame(at.n_out, at.w)
     depth = dr.maximum(dr.dot(at.p - y, n), 0)
 
     def step(j: mi.UInt32, *sums: list) -> tuple:
@@ -218,16 +215,6 @@ def _from(
     return RaySurroundings(L, V, depth)
 
 
-def _tangents(at: SurfacePoint) -> tuple[mi.Vector3f, mi.Vector3f]:
-    """Two axes across the normal, the first one along w."""
-    n = at.n_out
-    along = at.w - n * dr.dot(n, at.w)
-    spare, _ = mi.coordinate_system(n)
-    t = dr.normalize(dr.select(dr.squared_norm(along) > LEAST_SINE2, along, spare))
-    t = mi.Vector3f(dr.normalize(t - n * dr.dot(n, t)))
-    return t, mi.Vector3f(dr.cross(n, t))
-
-
 # ----------------------------------------------------------------------------------------------------
 # What the network is told of a pair of points: the medium, the pair as on a plane, and how far it is from a plane.
 # For a channel with l' = 1/sigma_t' and each end of the pair (exit and entry; d is the direction to the other end, e
@@ -239,9 +226,8 @@ def _tangents(at: SurfacePoint) -> tuple[mi.Vector3f, mi.Vector3f]:
 #              log of a phase function of g² between the two;
 #              1 - n_o.n_i, log of |y_i - y_o| over that of a plane, whether the line y_o y_i leaves the object, the
 #              length that it is outside for, l/(l + l'), log of the phase functions at y_o and y_i for light between
-# the
-#              two, over those of a plane, within 1/4 and 4, exp(-sigma_t |y_i - y_o|) less that of a plane, and the
-#              shares of S_0 that are mixed and scattered twice
+#              the two, over those of a plane, within 1/4 and 4, exp(-sigma_t |y_i - y_o|) less that of a plane, and
+#              the shares of S_0 that are mixed and scattered twice
 #     medium:  nine functions of albedo, g and eta, two of sigma_t' sqrt(area), five of `Mixed`
 #
 # What stands behind a semicolon, own numbers summed over both ends, is 0 on a plane. All are free of scale, place and

@@ -217,7 +217,7 @@ def surroundings(obj: TranslucentObject, frame: ObjectFrame, turns: np.ndarray |
     path = 1 / float(np.array(frame.sigma_t * frame.radius).ravel()[0])
     cell = max(CELL * path, longest / MOST)
     cells = np.maximum(np.ceil((high - low) / cell).astype(int), 2)
-    values = _fields(specs(obj, frame, low, cell, cells), max(path / cell, 1.0))
+    values = _fields(solid(obj, frame, low, cell, cells), max(path / cell, 1.0))
     places = mi.Point3f(*map(opaque, low)), mi.Vector3f(*map(opaque, 1 / (cell * cells)))
 
     def turned(turns: np.ndarray) -> Surroundings:
@@ -244,7 +244,7 @@ def _turns(obj: TranslucentObject, frame: ObjectFrame, fields: Surroundings) -> 
     return np.array(turns, dtype=np.float32)
 
 
-def specs(obj: TranslucentObject, frame: ObjectFrame, low: np.ndarray, cell: float, cells: np.ndarray) -> np.ndarray:
+def solid(obj: TranslucentObject, frame: ObjectFrame, low: np.ndarray, cell: float, cells: np.ndarray) -> np.ndarray:
     """1 where the middle of a cell lies inside, (z, y, x): where most of three rays meet the surface from within."""
     nx, ny, _ = (int(n) for n in cells)
     k = dr.arange(mi.UInt32, int(np.prod(cells)))

@@ -270,12 +270,10 @@ class Palette:
 
         def pair(*args: mi.Float | mi.Bool) -> tuple[mi.Float, mi.Float]:
             *query, active = args
-            return tuple(dr.select(active, self._over_power(m, query), 0) for m in (first, second))
+            powers = (opaque(float(m.medium.albedo) ** -self.power) for m in (first, second))
+            return tuple(dr.select(active, m.eval(*query) * p, 0) for m, p in zip((first, second), powers))
 
         return pair
-
-    def _over_power(self, model: BSSRDF, query: Sequence[mi.Float]) -> mi.Float:
-        return model.eval(*query) * opaque(float(model.medium.albedo) ** -self.power)
 
     def _of_networks(
         self, ends: Sequence[MediumAt], query: tuple[mi.Float, ...], by_albedo: bool, by_sigma_t: bool,

@@ -197,11 +197,12 @@ class Network:
         return torch.nn.functional.linear(x, W, b)[..., 0]
 
     @functools.cached_property
-    def _perceptron(self) -> Perceptron:
+    def perceptron(self) -> Perceptron:
+        """For Dr.Jit, with all outputs."""
         return Perceptron([W.T for W in self.matrices], self.biases, self.activation.drjit)
 
     def _drjit(self, features: Sequence[Lanes]) -> Lanes:
-        return self._perceptron(features)[0]
+        return self.perceptron(features)[0]
 
 
 LOG_RANGE = 30.0  # bound of the logarithm of the learnt factor

@@ -22,7 +22,6 @@ With one network, of the middle, the mean is 1.3, 1.8 and, for g = 0.8, 5.9 %.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
 
 import numpy as np
 
@@ -36,7 +35,6 @@ from halfspace_sss.neural.network import (
     symmetric_features,
     travel,
 )
-from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.physics.backbone import backbone_shape, length_scale
 from halfspace_sss.physics.medium import check_numbers
 
@@ -80,13 +78,9 @@ class ReducedNetworks:
             self.networks.append(Network((*net.matrices[:-1], last), (*net.biases[:-1], bias), net.activation))
             at += width
 
-    @cached_property
-    def _perceptrons(self) -> list[Perceptron]:
-        return [Perceptron([W.T for W in n.matrices], n.biases, n.activation.drjit) for n in self.networks]
-
     def functions(self, q: Query) -> list[Lanes]:
         """phi_0 ... phi_4 of a query in Dr.Jit."""
-        values = [net(_features(q, L)) for net, L in zip(self._perceptrons, self.lengths)]
+        values = [net.perceptron(_features(q, L)) for net, L in zip(self.networks, self.lengths)]
         return [sum(parts) for parts in zip(*values)]
 
 

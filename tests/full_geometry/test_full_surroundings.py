@@ -26,7 +26,7 @@ from full_geometry.transport.features import (  # noqa: E402
     n_side,
     pair_features,
     side_features,
-    specs,
+    solid,
 )
 from full_geometry.transport.storing import frame_of, identify  # noqa: E402
 from halfspace_sss import Medium  # noqa: E402
@@ -52,7 +52,7 @@ def _along_a_radius(obj: TranslucentObject, radii: list[float], way: tuple[float
 def test_cells_inside_of_a_ball_have_its_volume(ball: TranslucentObject) -> None:
     frame = frame_of(ball)
     cell, cells = 0.03, np.array([60, 70, 80])
-    inside = specs(ball, frame, -0.5 * cell * cells, cell, cells)
+    inside = solid(ball, frame, -0.5 * cell * cells, cell, cells)
     volume = inside.sum() * (cell * float(frame.radius[0] if np.ndim(frame.radius) else frame.radius)) ** 3
     assert inside.shape == (80, 70, 60)
     assert abs(volume / (4 / 3 * np.pi * 1.5**3) - 1) < 5e-3
