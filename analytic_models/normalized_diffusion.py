@@ -66,7 +66,7 @@ class NormalizedDiffusion(Separable):
     def __init__(self, medium: Medium) -> None:
         super().__init__(medium)
         m = medium.in_mfp()
-        albedos = [matched_albedos(m.channel(k).albedo_prime) for k in range(m.n_channels or 1)]
+        albedos = [matched_albedos(channel.albedo_prime) for channel in m.channels()]
         A_0, A_d = albedos[0] if m.n_channels is None else map(library(m.sigma_s).stack, zip(*albedos))
         rho = 2 * C_1(medium.eta)
         self.A = A_0 * (1 - rho) / (1 - rho * A_d)

@@ -114,14 +114,13 @@ def turned(task: Task) -> dict[str, object]:
     """What the knobs bring on a scene."""
     from benchmarks.knobs import channel_settings, entry_settings, node_settings, precision_settings
     from full_geometry.trade.techniques import stage
-    from halfspace_sss.neural.network import channels
 
     prepare()
     p = task.params
     on = stage(_scene(p, task.folder))
     settings = entry_settings(on, p["names"], p["seconds"], p["seed"])
     task.progress(1, 3)
-    media = channels(materials.load(p["material"]).medium)
+    media = materials.load(p["material"]).medium.channels()
     alone = [stage(_scene(p, task.folder, medium)) for medium in media]
     settings += channel_settings(on, alone, p["seconds"], p["seed"])
     task.progress(2, 3)

@@ -15,7 +15,6 @@ from figures.parts.part import Result, SceneDict, Task
 from full_geometry.trade.denoising import check_denoiser, cover, denoised, guides
 from full_geometry.transport.models import model_names
 from halfspace_sss import bssrdf
-from halfspace_sss.neural.network import channels
 from halfspace_sss.physics.medium import Medium
 
 if TYPE_CHECKING:
@@ -86,7 +85,7 @@ def _volume_scene(description: SceneDict, name: str, medium: Medium, rr_depth: i
     if np.ptp(medium.g) == 0:
         return with_media(description, mm_per_unit, integrator)
     results = []
-    for channel in channels(medium):
+    for channel in medium.channels():
         values = {key: float(getattr(channel, key)) for key in ("sigma_s", "sigma_a", "g", "eta")}
         one = {**description[name], "bsdf": {"type": "translucent", **values}}
         results.append(with_media({**description, name: one}, mm_per_unit, integrator))

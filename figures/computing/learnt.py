@@ -13,7 +13,6 @@ from figures.computing.scans import BUNNY, MM_PER_UNIT, SCANS, prepare, scan_sce
 from figures.modelling.objects import candle_parts, learnable_parts, make_varying
 from figures.parts.part import Part, Result, SceneDict, Task
 from halfspace_sss import materials
-from halfspace_sss.neural.network import channels
 from halfspace_sss.neural.store import weights_in
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder
@@ -127,7 +126,7 @@ def weight_files(model: str, medium: Medium) -> tuple[Path, ...]:
 
     trained = {module.KIND: module for module in (material_model, paper_model)}
     if model in trained:
-        return tuple(dict.fromkeys(trained[model].find_weights(model, m) for m in channels(medium)))
+        return tuple(dict.fromkeys(trained[model].find_weights(model, m) for m in medium.channels()))
     if model == "neural_shape":
         from full_geometry.transport import any_shape
 

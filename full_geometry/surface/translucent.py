@@ -473,8 +473,7 @@ class MediumSpec:
         return VARIABLE if self.textured is None else tuple(n for n in VARIABLE if n in self.textured.constants)
 
     def channels(self) -> list[Medium]:
-        n = self.medium.n_channels
-        return [self.medium] if n is None else [self.medium.channel(k) for k in range(n)]
+        return self.medium.channels()
 
     def changed(self, **values: np.ndarray) -> MediumSpec:
         """The same with other constants, and with textures as they are now.

@@ -34,7 +34,6 @@ from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.comparison.curve_set import TRACED
 from halfspace_sss.comparison.model_errors import TracedMaps, model_error, references
 from halfspace_sss.comparison.reflectance_curves import evaluations_per_s
-from halfspace_sss.neural.network import channels
 from halfspace_sss.noise_free import NoiseFree, short
 from halfspace_sss.physics.medium import Medium, medium_of
 from halfspace_sss.provenance import without_nan
@@ -329,7 +328,7 @@ def recommend_flat(
     check_count("seed", seed, 0)
     for name in models or ():
         check_choice("model", name, registered())
-    parts = [m for m in channels(medium) if float(m.sigma_s) > 0]
+    parts = [m for m in medium.channels() if float(m.sigma_s) > 0]
     if not parts:
         raise ValueError("medium must scatter, got albedo 0: S of order 2 and more is 0, no model is needed")
     _check_range(r)

@@ -126,7 +126,6 @@ def _media(
     from halfspace_sss import materials
     from halfspace_sss.checks import check_count
     from halfspace_sss.comparison.model_errors import held_out_media
-    from halfspace_sss.neural.network import channels
 
     if many.as_trained and many.held_out is None:
         raise ValueError("as_trained must come with held_out, got it alone")
@@ -140,7 +139,7 @@ def _media(
     results = {}
     for title, medium in stated.media(materials.names() if many.registry else names, channel).items():
         labels = () if channel or title == "medium" else materials.load(title).channels
-        for label, one in zip(labels or ("",), channels(medium)):
+        for label, one in zip(labels or ("",), medium.channels()):
             if float(one.albedo) > 0 or not labels:
                 results[f"{title} {label}".strip()] = one
     return results

@@ -189,8 +189,7 @@ class BSSRDF(abc.ABC):
 
     @functools.cached_property
     def _radial_samplers(self) -> list[RadialSampler]:
-        media = [self.medium.in_mfp().channel(k) for k in range(self.medium.n_channels or 1)]
-        return [RadialSampler(self.for_medium(m).eval) for m in media]
+        return [RadialSampler(self.for_medium(m).eval) for m in self.medium.in_mfp().channels()]
 
     def for_medium(self, medium: Medium) -> BSSRDF:
         """The same model, made with the same options, of another medium."""

@@ -128,8 +128,7 @@ def _units(
     return [
         (name, channel, MapUnit(mfp, grid, a, seed, stream=channel, **stop))
         for name, medium in media.items()
-        for channel in range(medium.n_channels or 1)
-        for mfp in (medium.channel(channel).in_mfp(),)
+        for channel, mfp in enumerate(medium.in_mfp().channels())
         for a in range(grid.n_theta)
     ]
 
@@ -162,7 +161,7 @@ def _template(medium: Medium, grid: MapGrid, seed: int) -> xr.Dataset:
     """All coordinates, and data that say nothing yet: NaN, count 0, no checksum."""
     import xarray as xr
 
-    channels = [medium.channel(k).in_mfp() for k in range(medium.n_channels or 1)]
+    channels = medium.in_mfp().channels()
     mu_i, mu_o, delta_phi = map_directions(medium.channel(0), grid, seed)
     edges = np.stack([cell_edges(m, grid)[0] for m in channels])
     psi = cell_edges(channels[0], grid)[1]

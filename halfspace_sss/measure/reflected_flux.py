@@ -134,7 +134,7 @@ def _lattice(model: BSSRDF, mu_i: Incidence) -> Integral:
     """By the lattice, for a number, an array or "diffuse", with the channel axis last if the medium has one."""
     _check_diffuse(mu_i)
     m = model.medium
-    parts = [model] if m.n_channels is None else [model.for_medium(m.channel(k)) for k in range(m.n_channels)]
+    parts = [model] if m.n_channels is None else [model.for_medium(one) for one in m.channels()]
     diffuse = isinstance(mu_i, str)
     mu, w = cosine_nodes(m.eta, DIFFUSE_COSINES) if diffuse else (checked_cosines(mu_i), None)
     result = np.array([[lattice_reflectance(part, one) for part in parts] for one in mu.ravel().tolist()])
@@ -370,7 +370,7 @@ def weight_variance(model: BSSRDF, mu_o: float = 0.8, n: int = 1 << 14, seed: in
     check_count("n", n, 2)
     check_count("seed", seed, 0)
     if model.medium.n_channels is not None:
-        parts = [model.for_medium(model.medium.channel(k)) for k in range(model.medium.n_channels)]
+        parts = [model.for_medium(m) for m in model.medium.channels()]
         return np.array([weight_variance(part, mu_o, n, seed) for part in parts])
     u = np.random.default_rng(seed).random((4, n))
     at = model.sample_position(mu_o, (u[0], u[1]))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from halfspace_sss.neural.network import N_FEATURES, SILU, Activation, Network, SymmetricModel, channels, layer_shapes
+from halfspace_sss.neural.network import N_FEATURES, SILU, Activation, Network, SymmetricModel, layer_shapes
 from halfspace_sss.neural.store import check_medium, find_weights, load_weights, record_count
 from halfspace_sss.physics.medium import Medium
 
@@ -46,5 +46,5 @@ class NeuralMaterial(SymmetricModel):
     def __init__(self, medium: Medium) -> None:
         super().__init__(medium)
         self.networks: list[Network] = [
-            load_network(find_weights(KIND, m), KIND, m, N_FEATURES) for m in channels(medium)
+            load_network(find_weights(KIND, m), KIND, m, N_FEATURES) for m in medium.channels()
         ]

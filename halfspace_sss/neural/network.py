@@ -270,7 +270,7 @@ class SymmetricModel(BSSRDF):
         m, calibrations = self.medium, self.calibrations or [()] * len(self.networks)
         if m.n_channels is None:
             return factored_G(self.networks[0], q, m.albedo, m.g, m.eta, calibrations[0])
-        parts = zip(self.networks, calibrations, channels(m), channel_queries(q, m))
+        parts = zip(self.networks, calibrations, m.channels(), channel_queries(q, m))
         return q.lib.stack([factored_G(n, one, c.albedo, c.g, c.eta, calibration) for n, calibration, c, one in parts])
 
 
@@ -284,8 +284,3 @@ def channel_queries(q: Query, medium: Medium) -> list[Query]:
         )
         for k in range(medium.n_channels)
     ]
-
-
-def channels(medium: Medium) -> list[Medium]:
-    """The scalar media of the channels."""
-    return [medium.channel(k) for k in range(medium.n_channels or 1)]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from halfspace_sss.arrays import Library, Real
 from halfspace_sss.interface.model import BSSRDF, Query
 from halfspace_sss.neural.material_model import load_network
-from halfspace_sss.neural.network import RELU, Network, channel_queries, channels
+from halfspace_sss.neural.network import RELU, Network, channel_queries
 from halfspace_sss.neural.store import find_weights, load_weights, record_number
 from halfspace_sss.physics.backbone import U_MAX, length_scale
 from halfspace_sss.physics.fresnel import F_t, sine
@@ -56,7 +56,7 @@ class NeuralPaper(BSSRDF):
     def __init__(self, medium: Medium, trained: Sequence[tuple[Network, float]] | None = None) -> None:
         super().__init__(medium)
         self.trained: list[tuple[Network, float]] = list(trained or ())
-        for m in () if trained else channels(medium):
+        for m in () if trained else medium.channels():
             file = find_weights(KIND, m)
             scale = record_number(file, load_weights(file, KIND)[1], "scale", 0.0, 1e30)
             self.trained.append((load_network(file, KIND, m, N_INPUTS, RELU), scale))
@@ -72,7 +72,7 @@ class NeuralPaper(BSSRDF):
         """G before negative values are set to zero."""
         m = self.medium
         queries = [q] if m.n_channels is None else channel_queries(q, m)
-        values = [self._one(*parts) for parts in zip(queries, channels(m), self.trained)]
+        values = [self._one(*parts) for parts in zip(queries, m.channels(), self.trained)]
         return values[0] if m.n_channels is None else q.lib.stack(values)
 
     def _one(self, query: Query, m: Medium, trained: tuple[Network, float]) -> Real:

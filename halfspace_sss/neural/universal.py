@@ -20,7 +20,6 @@ from halfspace_sss.neural.network import (
     N_TERMS,
     Network,
     SymmetricModel,
-    channels,
     layer_shapes,
     medium_features,
 )
@@ -180,7 +179,7 @@ class Neural(SymmetricModel):
         check_range(medium)
         self.weights: Path = weights or shipped_weights()
         hyper = load_hypernetwork(self.weights)
-        ratios = [(m.albedo, m.g, m.eta) for m in channels(medium)]
+        ratios = [(m.albedo, m.g, m.eta) for m in medium.channels()]
         self.networks: list[Network] = [hyper.network(*one) for one in ratios]
         self.calibrations: list[tuple[float, ...]] = [hyper.calibration(*one) for one in ratios]
 

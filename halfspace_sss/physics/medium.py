@@ -345,6 +345,10 @@ class Medium:
         s, a, g = (v if self.n_channels is None else v[index] for v in (self.sigma_s, self.sigma_a, self.g))
         return Medium(s, a, g, self.eta)
 
+    def channels(self) -> list[Medium]:
+        """The scalar media of the channels; of a scalar medium itself."""
+        return [self.channel(k) for k in range(self.n_channels or 1)]
+
     @property
     def has_derivatives(self) -> bool:
         """Whether torch records derivatives by the coefficients."""
@@ -373,7 +377,7 @@ class Medium:
         head = "".join(f"<th>{name} {units.get(name, '')}</th>" for name in names)
         rows = "".join(
             "<tr>" + "".join(f"<td>{_short(getattr(m, name))}</td>" for name in names) + "</tr>"
-            for m in (self.detached().channel(k) for k in range(self.n_channels or 1))
+            for m in self.detached().channels()
         )
         return f"<table><caption>medium, eta {self.eta:.4g}</caption><tr>{head}</tr>{rows}</table>"
 

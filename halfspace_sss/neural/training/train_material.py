@@ -18,7 +18,7 @@ from halfspace_sss.maps.noisy_maps import CellGrid, draw_directions, make_pool
 from halfspace_sss.materials import load
 from halfspace_sss.neural import material_model, paper_model
 from halfspace_sss.neural.material_model import network_arrays
-from halfspace_sss.neural.network import Network, SymmetricModel, channels
+from halfspace_sss.neural.network import Network, SymmetricModel
 from halfspace_sss.neural.paper_model import NeuralPaper
 from halfspace_sss.neural.store import check_weights_folder, save_weights, weights_folder, weights_name
 from halfspace_sss.neural.training.fit import CHECKPOINT, Fit, claim, fit
@@ -248,7 +248,7 @@ def train(
     check_count("seed", seed, 0)
     if target_error is not None:
         check_interval("target_error", target_error, 1e-4, 1.0)
-    media = channels(material if isinstance(material, Medium) else load(material).medium)
+    media = (material if isinstance(material, Medium) else load(material).medium).channels()
     check_weights_folder(folder)
     if work is not None:
         check_folder(work)
