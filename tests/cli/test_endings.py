@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow
 
 SMALL = {  # a small run of each command, and what it refuses
     "curves": (["--paths", "4096", "--theta-i", "0", "--model", "better_dipole", "--out", "o"], ["marbel"]),
-    "errors materials": (["--model", "better_dipole", "--events", "1e4", "--out", "o"], ["marbel"]),
+    "errors materials": (["marble", "--model", "better_dipole", "--events", "1e4", "--out", "o"], ["marbel"]),
     "errors object": (["--scene", "ball.xml", "--model", "better_dipole", "--out", "o"], ["--scene", "none.xml"]),
     "errors truths": (["--model", "better_dipole", "--out", "o"], ["--model", "nope"]),
     "figures all": (["fig10", "--out", "o"], ["nope"]),
@@ -37,7 +37,7 @@ SMALL = {  # a small run of each command, and what it refuses
     "train object": (["--scene", "ball.xml", "--out", "o"], ["--scene", "none.xml"]),
     "train shapes": (["--out", "o"], ["--mesh", "none.ply"]),
     "train universal": (["--out", "o"], ["--steps", "0"]),
-    "validate": (["--rows", "thirdparty", "--quick", "--out", "o"], ["--rows", "nope"]),
+    "validate": (["--rows", "T0134", "--quick", "--out", "o"], ["--rows", "nope"]),
     "view": (["ball.xml", "--port", "0"], ["none.xml"]),
 }
 HARNESS = """
@@ -45,12 +45,14 @@ import atexit, dataclasses, gc, json, os, signal, subprocess, sys
 from pathlib import Path
 import matplotlib.pyplot, pandas, scipy.interpolate, torch, zarr  # once for all runs: each is a fork
 from halfspace_sss.cli import shared
+from figures import fig10
 from figures.parts import command
 from figures import app as cli
 from figures.command_line import main
 from halfspace_sss.maps.noisy_maps import CellGrid
 from halfspace_sss.neural.training.train_material import FAST
 training = sys.modules["halfspace_sss.neural.training.train_material"]  # a function of the package has its name
+fig10.WALKS["draft"] = 2**14
 training.FAST = dataclasses.replace(FAST, n_groups=16, events=1e5, grid=CellGrid(8, 4))
 command.MOST_WORKERS = 1  # the process that is interrupted writes the files, and no other has written some by then
 gc.freeze()
