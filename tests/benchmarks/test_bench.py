@@ -97,7 +97,7 @@ def test_guided_walks_have_the_reflectance_of_plain_ones(tmp_path: Path) -> None
 
 
 @pytest.mark.slow
-def test_traces_and_edits_are_measured_on_a_cpu_too(tmp_path: Path) -> None:
+def test_traces_and_edits_are_measured_on_a_cpu_too(tmp_path: Path, little_light: None) -> None:
     assert _invoke("--quick", "--only", "trace", "--only", "edits", "--out", str(tmp_path)).exit_code == 0
     assert [row["way"] for row in _rows(tmp_path / "bench_edits.csv")] == ["better_dipole, gathered", "walk"]
     (row,) = _rows(tmp_path / "bench_trace.csv")

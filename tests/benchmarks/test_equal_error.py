@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas
 import pytest
+from quick_light import gather_by_few
 
 from benchmarks import equal_error, equal_error_tables
 from benchmarks.equal_error import MODELLED, STEPS, furnace, furnace_models, modelled_contender, modelled_scene
@@ -47,6 +48,9 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Result]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training, "train_unattended", lambda *a, **how: train(*a, **{**how, "recipe": QUICK}))
         patch.setitem(equal_error.CHUNKS, "draft", 1)
+        gather_by_few(patch.setattr)
+        for name, value in (("EXITS", 16), ("WALKS", 128), ("SAMPLES", 64)):
+            patch.setattr(training, name, value)
         patch.setattr(equal_error, "SUBJECTS", {"ketchup": ("bunny", "ketchup")})
         patch.setitem(equal_error.COMPARED, "draft", {"ketchup": ("even sky",)})
         patch.setattr(equal_error, "OBJECTS", ())

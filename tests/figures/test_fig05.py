@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas
 import pytest
+from quick_light import gather_by_few
 
 mi = pytest.importorskip("mitsuba")
 pytest.importorskip("torch")
@@ -30,6 +31,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Result]:
     train = training.train
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training, "train", lambda *a, **how: train(*a, **{**how, "recipe": QUICK, "chunks": 2}))
+        gather_by_few(patch.setattr)
         for name, value in (("EXITS", 16), ("WALKS", 128), ("SAMPLES", 64)):
             patch.setattr(training, name, value)
         for name, value in (("SCENES", (("ketchup", "both"),)), ("SIZES", SIZE), ("TRUTH_SPP", 64)):

@@ -133,12 +133,11 @@ def test_light_of_the_flame_enters_the_wax_as_a_sum_over_both_surfaces_says(fold
 
 
 def test_every_part_of_the_wax_has_the_light_of_walks_within_the_stated_error(folder: Path, trained: Trained) -> None:
-    """The half-space is off by up to 2.5 times: what it sends back goes through the wall."""
-    samples = {"full_geometry": 3 * SPP // 2, WALK: 6 * SPP, "better_dipole": SPP}  # rare bright paths reach the rim
-    found, walked, plane = (rendered(candle(folder, model, -1), spp) for model, spp in samples.items())
+    """A half-space is off by up to 2.5 times: what it sends back goes through the wall."""
+    samples = {"full_geometry": 3 * SPP // 2, WALK: 6 * SPP}  # rare bright paths reach the rim
+    found, walked = (rendered(candle(folder, model, -1), spp) for model, spp in samples.items())
     stated = np.array([row.error for row in trained.errors if row.light == LIGHTS[1]])
     noise = np.hypot(*(v.std(axis=0, ddof=1) / np.sqrt(PASSES) / v.mean(axis=0) for v in (found, walked)))
-    off, of_plane = (np.abs(v.mean(axis=0) / walked.mean(axis=0) - 1) for v in (found, plane))
+    off = np.abs(found.mean(axis=0) / walked.mean(axis=0) - 1)
     assert np.all(stated < 0.2) and np.all(noise < 0.06)
     assert np.all(off < stated + 4 * noise), (off, stated, noise)
-    assert of_plane.max() > 3 * (stated + 4 * noise).max()

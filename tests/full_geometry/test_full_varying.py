@@ -104,7 +104,7 @@ def test_a_grid_of_one_value_gives_the_first_event_of_the_homogeneous_medium() -
 def test_training_halves_the_error_of_the_half_space_in_a_medium_that_varies(trained: Trained) -> None:
     obj = trained.model.object
     proposals = EntryProposals(obj, HalfSpace(obj, "better_dipole"))
-    truth = reference(obj)
+    truth = reference(obj, 128, 1024)
     plane = compare(modelled(transport_of(obj, "better_dipole"), proposals, truth.exits, 1024), truth.truth)
     assert np.all(constant(trained.errors) < 0.5 * constant(plane))
 

@@ -100,11 +100,14 @@ def test_an_object_without_weights_has_cost_no_training(boundary: dict, monkeypa
         assert measuring.training_seconds(loaded, "ball0", model) == 0
 
 
+@pytest.mark.usefixtures("little_light")
 @pytest.mark.slow
 def test_a_way_that_cannot_be_is_left_out_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HALFSPACE_SSS_WEIGHTS", "none")
     for boundary, why in (({}, "must be trained"), (ROUGH, "must be smooth under a model, got a RoughDielectric")):
-        found = recommend(scene(**boundary), tolerance=0.3, assess_seconds=0.4, exits=64)
+        found = recommend(
+            scene(**boundary), tolerance=0.3, models=[*FEW, "full_geometry"], assess_seconds=0.2, exits=64
+        )
         (learnt,) = (option for option in found.objects[0].options if option.way == "full_geometry")
         assert why in learnt.why
         assert found.objects[0].way is not None
@@ -155,9 +158,9 @@ def test_all_channels_of_exits_and_images_are_traced_once_and_by_one_kernel() ->
     assert len(paths) == len(found.launches) - known + 1 == 2 and len(set(paths)) == 1
 
 
-def test_ten_objects_are_assessed_one_by_one() -> None:
-    found = assess(scene(n=10), models=["lambert"], **{**QUICK, "seconds": 0.05, "exits": 32})
-    assert [o.object for o in found.objects] == [f"ball{k}" for k in range(10)]
+def test_four_objects_are_assessed_one_by_one() -> None:
+    found = assess(scene(n=4), models=["lambert"], **{**QUICK, "seconds": 0.05, "exits": 32})
+    assert [o.object for o in found.objects] == [f"ball{k}" for k in range(4)]
     assert all(o.ways for o in found.objects)
 
 
@@ -182,6 +185,7 @@ def windows() -> np.ndarray:
     return pixels
 
 
+@pytest.mark.usefixtures("little_light")
 def test_the_second_look_goes_on_with_the_samples_of_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
     known: list[tuple[Technique, int, Any]] = []
 
@@ -227,15 +231,6 @@ def test_precomputed_light_of_walks_has_less_variance_and_no_bias_beside_its_noi
     assert row.variance + 4 * row.variance_error < 0.5 * found.traced.variance
 
 
-def test_corrected_light_has_a_fifth_of_the_bias_of_gathered_light_at_most() -> None:
-    thin, models = {"sigma_s": 2.0, "sigma_a": 0.02}, ["better_dipole, gathered", "better_dipole, corrected"]
-    found = assess(scene(thin), models=models, flip=False, samples=512, exits=64).objects[0]
-    gathered, corrected = map(found.way, models)
-    assert gathered.bias2 > 0.15**2
-    assert np.sqrt(max(corrected.bias2 - 3 * corrected.bias2_error, 0)) < np.sqrt(gathered.bias2) / 5
-    assert corrected.seconds > gathered.seconds  # by its walks
-
-
 def test_walks_refuse_to_precompute_light_where_that_cannot_be() -> None:
     ways = [WALKS, PRECOMPUTED_WALKS]
     found = assess_stage(stage(scene(orders="multiple")), ways, Effort(samples=48, exits=32)).objects[0]
@@ -270,6 +265,7 @@ def _found(*ways: tuple[str, float, float]) -> Assessment:
 CHANCE, QUICKER = ("path_traced", 0.0, 1e-5), ("path_traced, precomputed", 0.0, 1e-6)
 
 
+@pytest.mark.usefixtures("little_light")
 @pytest.mark.parametrize("arguments", [["--model", "auto", "--spp", "1"], ["--target-error", "0.5"]])
 def test_the_command_takes_the_cheapest_way_where_that_is_left_to_it_and_finds_it_again(
     arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -300,6 +296,7 @@ def test_auto_inside_the_integrator_of_models_refuses_what_none_of_them_keeps(mo
         loaded.integrator().prepare(loaded)
 
 
+@pytest.mark.usefixtures("little_light")
 def test_auto_takes_corrected_light_of_a_clear_object(monkeypatch: pytest.MonkeyPatch) -> None:
     """Objects are made for the light that is chosen: gathered light of this one is refused."""
     monkeypatch.setattr(automatic, "assess_for", lambda *args: _found(CHANCE, ("better_dipole, corrected", 0.0, 1e-8)))
@@ -317,6 +314,7 @@ def _painted(*albedos: float) -> dict[str, Any]:
     return {"albedo": bitmap, "sigma_t": 10.0}
 
 
+@pytest.mark.usefixtures("little_light")
 def test_a_textured_object_is_assessed_by_the_ways_that_take_it() -> None:
     """A texture of one colour is as far from walks as its medium; others of two colours say what they refuse."""
     ways = ["better_dipole", "neural_shape", "better_dipole, gathered"]
@@ -331,21 +329,12 @@ def test_a_textured_object_is_assessed_by_the_ways_that_take_it() -> None:
     assert recommend(found, tolerance=0.9).objects[0].way in ("path_traced", *ways)
 
 
-@pytest.mark.slow
-def test_auto_of_a_textured_object_is_a_model_that_takes_textures() -> None:
-    painted = scene(_painted(0.95, 0.5), model="auto")
-    painted["integrator"]["tolerance"] = 0.4  # a small ball: models of the half-space are 14 % off
-    loaded = mi.load_dict(painted)
-    (obj,) = loaded.integrator().prepare(loaded)
-    assert obj.textured is not None and obj.transport is not None
-    assert np.isfinite(mi.render(loaded, spp=1).numpy()).all()
-
-
 def test_an_unknown_way_is_refused_with_the_nearest() -> None:
     with pytest.raises(ValueError, match="did you mean 'neural'"):
         assess(scene(), models=["nural"], **QUICK)
 
 
+@pytest.mark.usefixtures("little_light")
 @pytest.mark.slow
 def test_auto_is_chosen_once_kept_and_found_again(tmp_path: Path) -> None:
     names = []
@@ -392,14 +381,6 @@ def test_tiles_that_are_drawn_where_samples_differ_have_the_mean_of_the_object()
     assert abs(normals.mean()) < 0.01 and x[w > 0].mean() > 0.2
     assert abs((w * x).sum() / w.sum()) < 0.1  # six seeds: 0 ± 0.06
     assert np.array_equal(_apart(_side_by_side(tiles.guides), w.shape), tiles.guides.astype(np.float32))
-
-
-def test_half_precision_of_a_network_is_measured_beside_single() -> None:
-    from benchmarks.knobs import precision_settings
-
-    single, half = precision_settings(Medium.from_albedo(0.9, 1.0, 0.0, 1.3), events=2e5)
-    assert (single.value, single.cost, half.value) == ("float32", 1.0, "float16")
-    assert half.cost > 0 and abs(half.error - single.error) < 0.01
 
 
 def test_lambert_in_a_white_furnace_is_the_diffuse_reflectance_and_what_the_boundary_mirrors() -> None:
