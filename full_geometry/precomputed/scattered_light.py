@@ -10,7 +10,7 @@ bring both to the cells, once for an image. At event FEW of a stay in an object 
 and ends. Events before that one add L_0 + L_u. So each path is found once: one of fewer than FEW events since the
 camera's path entered at the last of them, all others at event FEW.
 
-A path of light begins as rays of unscattered light do, or at glass that overlaps objects, and may also be reflected
+A path of light begins as rays of unscattered light do, or at glass over or about objects, and may also be reflected
 there. It walks through objects and between them, and through glass in or over them. Each of its events adds the weight
 with which it arrives over sigma_s, the estimate of ∫ L dw dx by collisions, but for those that L_0 holds: the first
 event of a path that has met nothing but the boundary of its first object. Light by way of other surfaces is left to
@@ -51,6 +51,7 @@ from halfspace_sss.tracing.walk import generator, pass_seed
 FEW = 3  # dragon of marble: 2, 3 and 5 have 20, 13 and 7 times less variance x time, ever less of the noise of cells
 MOST_ADJOINT = 4.0
 AT_ONCE, CANDIDATES = 2**17, 2  # paths, and points with light for each of them
+PROBES = 2**12  # points that tell how much light reaches an object
 ONWARD = 0.25  # share of walks that go on beyond FEW events where other surfaces than objects may send light
 
 
@@ -79,14 +80,23 @@ class ScatteredLight(Visitor):
     D: mi.Float
     slots: int
 
+    def flux(self, k: int, seed: int) -> float:
+        """About the flux of the emitters at object or glass k, of the brightest channel."""
+        rng = generator(mi, PROBES, pass_seed(seed, k, 2))
+        _, flux = lit_points(self.scene, self.media, k, PROBES, (seed, k, 2), rng)
+        return float(dr.sum(dr.max(dr.abs(flux)))[0])
+
     def trace(self, k: int, number: int, seed: int) -> None:
         """Add the light of so many paths that begin on object or glass k, or a few more."""
         parts = math.ceil(number / AT_ONCE)
         for part in range(parts):
-            self._trace(self._starts(k, math.ceil(number / parts), parts, (seed, k, part)), (seed, k, part))
+            starts = self._starts(k, math.ceil(number / parts), parts, (seed, k, part))
+            if starts is not None:
+                self._trace(starts, (seed, k, part))
 
-    def _starts(self, k: int, number: int, parts: int, seed: tuple[int, ...]) -> tuple:
-        """Where paths of about equal flux begin: o, d, off, object, `Walk.within`, whether there is light, the path."""
+    def _starts(self, k: int, number: int, parts: int, seed: tuple[int, ...]) -> tuple | None:
+        """Where paths of about equal flux begin: o, d, off, object, `Walk.within`, whether there is light, the path.
+        None where no light reaches."""
         # ---- points of the surface with a sample of the emitters, refracted or reflected there: flux *= f cos / p
         many = CANDIDATES * number
         rng = generator(mi, many, pass_seed(*seed, 1))
@@ -104,6 +114,8 @@ class ScatteredLight(Visitor):
         # ---- of these a few, each with the probability of its flux, in order along the faces
         ends = dr.cumsum(dr.float64_array_t(mi.Float)(size))
         total = float(ends[-1])
+        if total == 0:
+            return None
         first, step = (dr.opaque(type(ends), v) for v in (float(u[0]), total / number))
         at = (dr.arange(type(ends), number) + first) * step
         which = dr.binary_search(0, many - 1, lambda i: dr.gather(type(ends), ends, i) < at)

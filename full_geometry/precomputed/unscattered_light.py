@@ -168,9 +168,11 @@ def _with_paths(
     D = dr.zeros(mi.Float, 2 * n * slots)
     dr.eval(D)
     tracer = ScatteredLight(scene, media, light.index, light.tables, D, slots)
+    # by the flux that reaches each object or piece of glass
     starts = media.lit_from_outside
-    for k in starts:
-        tracer.trace(k, max(paths // len(starts), FEWEST_PATHS), seed)
+    flux = np.array([tracer.flux(k, seed) for k in starts])
+    for k, share in zip(starts, flux / max(flux.sum(), 1e-30)):
+        tracer.trace(k, max(int(share * paths), FEWEST_PATHS), seed)
 
     # ---- the fit of each: L_s, then L_u, which has not scattered
     parts, first = [], 0

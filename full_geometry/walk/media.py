@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import ModuleType
@@ -26,12 +28,13 @@ from full_geometry.geometry.instances import (
 from full_geometry.geometry.points import lift
 from full_geometry.geometry.rounding import clear
 from full_geometry.geometry.shape import Geometry, analyse_shape, check_together, name_of, pointer_numbers, scene_of
-from full_geometry.objects.inclusions import Inclusion, find_inclusions, refracts
+from full_geometry.geometry.snapshot import Snapshot
+from full_geometry.objects.inclusions import Inclusion, check_sensors, find_inclusions, refracts
 from full_geometry.objects.objects import TranslucentObject, translucent_shapes
 from full_geometry.objects.small_emitters import is_delta
 from full_geometry.settings import MM_PER_UNIT, NO_OBJECT
 from full_geometry.surface.sheets import check_sheets
-from full_geometry.surface.translucent import MediumSpec, is_rough, is_smooth_boundary, smooth_boundary
+from full_geometry.surface.translucent import DIELECTRICS, MediumSpec, is_rough, is_smooth_boundary, smooth_boundary
 from full_geometry.surface.varying import VaryingMedium, eval_volume
 from full_geometry.surface.wrapped import Wrapping, surface_of, wrapping_of
 from full_geometry.walk.emission import unmasked_surface
@@ -61,8 +64,10 @@ class InclusionTable:
             the number of an object, whether it stands `alone`, neither in another nor around anything, and whether it
             is `enclosed` by another and overlaps nothing.
         lights: the delta lights in the medium of an object, and its number.
-        glass: geometry of the shapes that refract in them, and of those that hold or overlap such glass.
-        priorities: of what overlaps; None where nothing does.
+        glass: geometry of the shapes that refract in them, of those that hold or overlap such glass, and of glass
+            about objects, which their light passes.
+        priorities: of what overlaps, and of glass outside; None where there is neither.
+        surfaces: snapshots of the BSDFs of glass with priorities.
     """
 
     scene: mi.Scene
@@ -71,20 +76,28 @@ class InclusionTable:
     lights: list[tuple[mi.Emitter, int]]
     glass: list[Geometry]
     priorities: Priorities | None = None
+    surfaces: Sequence[Snapshot] = ()
 
     @classmethod
     def of(cls, scene: mi.Scene, objects: list[Geometry]) -> InclusionTable | None:
-        """What lies inside; None if nothing does.
+        """What lies inside, and glass outside; None where there is neither.
         ValueError if something inside that refracts is not closed, objects count some orders only, or as of
         `Priorities.of`."""
-        result = find_inclusions(scene, objects)
-        if not result:
+        outer = _glass_outside(scene, objects)
+        with contextlib.suppress(ValueError):  # of glass that can be no member: light by way of it is left to chance
+            return cls._of(scene, objects, outer)
+        return cls._of(scene, objects, [])
+
+    @classmethod
+    def _of(cls, scene: mi.Scene, objects: list[Geometry], outer: list[Geometry]) -> InclusionTable | None:
+        """The same with these pieces of glass outside."""
+        result = find_inclusions(scene, [*objects, *outer])
+        if not result and not outer:
             return None
         # ---- what displaces the medium around it holds things of its own: these are looked for again
-        groups = shown_groups(scene)
+        groups, glass = shown_groups(scene), list(outer)
         own = InstanceTable([obj.shape for obj in objects], groups)
-        _check(result, objects, own)
-        glass: list[Geometry] = []
+        _check([inclusion for inclusion in result if inclusion.object < len(own)], objects, own)
         while more := [s for s in _shapes(result) if _displaces(s) and not any(s is piece.shape for piece in glass)]:
             glass += [analyse_shape(shape, scene) for shape in more]
             for piece in glass:
@@ -101,7 +114,10 @@ class InclusionTable:
 
         # ---- what is around each: the smallest holder comes last and stays
         around, lights, result = np.full(len(instance_table), -1), {}, _largest_first(result, holders)
-        priorities = Priorities.of(scene, result, holders, objects, groups)
+        outside = {
+            int(first) for shape, first in zip(holders.shapes, holders.first) if any(shape is o.shape for o in outer)
+        }
+        priorities = Priorities.of(scene, result, holders, objects, groups, outside)
         holding, held = np.zeros(len(own), dtype=bool), np.zeros(len(instance_table), dtype=bool)
         for inclusion in result:
             number = inclusion.object if inclusion.object < len(own) else -1
@@ -123,7 +139,12 @@ class InclusionTable:
         tables["displaces"] = mi.Bool([displaces[kind] for kind in instance_table.kind])
         dr.make_opaque(tables)
         lights = [(light, k) for light, k in lights.values() if is_delta(light) and k >= 0]
-        return cls(instance_table.scene(scene), instance_table, tables, lights, glass, priorities)
+        surfaces = [] if priorities is None else [Snapshot(piece.shape.bsdf()) for piece in glass]
+        return cls(instance_table.scene(scene), instance_table, tables, lights, glass, priorities, surfaces)
+
+    def is_current(self) -> bool:
+        """Whether glass that overlaps still has the index and roughness that boundaries were made of."""
+        return all(Snapshot(piece.shape.bsdf()) == was for piece, was in zip(self.glass, self.surfaces))
 
     @property
     def shines(self) -> bool:
@@ -158,6 +179,33 @@ def _shapes(result: list[Inclusion]) -> list[mi.Shape]:
 
 def _displaces(shape: mi.Shape) -> bool:
     return not surface_of(shape) and refracts(shape)
+
+
+def _glass_outside(scene: mi.Scene, objects: list[Geometry]) -> list[Geometry]:
+    """Closed dielectrics outside of objects and about one, with neither a lamp nor a camera inside.
+
+    They are about an object where their box holds its own, as that of a bell jar does.
+    """
+    # ---- boxes of objects, those of instances where they stand
+    own, results = InstanceTable([obj.shape for obj in objects], shown_groups(scene)), []
+    ends = [ends_of(corners(shape.bbox(), own.to_world(kind))) for kind, shape in enumerate(own.shapes)]
+    low, high = (np.concatenate(rows) for rows in zip(*ends)) if ends else (np.zeros((0, 3)),) * 2
+
+    # ---- dielectrics about them
+    for shape in scene.shapes():
+        box = shape.bbox()
+        about = ((low > np.array(box.min)) & (high < np.array(box.max))).all(axis=1).any()
+        if not about or not _displaces(shape) or shape.bsdf().class_name() not in DIELECTRICS:
+            continue
+        with warnings.catch_warnings(), contextlib.suppress(ValueError):  # of a sheet, or a camera inside
+            warnings.simplefilter("ignore")
+            piece = analyse_shape(shape, scene)
+            check_sensors(scene, [piece])
+            inside = [inclusion.node for inclusion in find_inclusions(scene, [piece])]
+            if piece.closed and not any(isinstance(node, mi.Emitter) or node.is_emitter() for node in inside):
+                results.append(piece)
+    held = {id(inclusion.node) for inclusion in find_inclusions(scene, objects)} if results else set()
+    return [piece for piece in results if id(piece.shape) not in held]
 
 
 def _largest_first(result: list[Inclusion], holders: InstanceTable) -> list[Inclusion]:
@@ -440,7 +488,8 @@ class WalkMedia:
     def is_current(self) -> bool:
         """Whether the objects still have the shapes and the media that this was made of."""
         pairs = zip(self.objects, self.specs)
-        return all(inside is surface_of(obj.shape).spec and obj.is_current() for obj, inside in pairs)
+        same = all(inside is surface_of(obj.shape).spec and obj.is_current() for obj, inside in pairs)
+        return same and (self.inner is None or self.inner.is_current())
 
     def renewed(self) -> WalkMedia | None:
         """The same shapes with the media that they have now; None if they moved, or hold or are around something."""

@@ -59,11 +59,11 @@ class Priorities:
     @classmethod
     def of(
         cls, scene: mi.Scene, result: list[Inclusion], holders: InstanceTable, objects: list[Geometry],
-        groups: list[Group],
+        groups: list[Group], outer: set[int],
     ) -> Priorities | None:  # fmt: skip
-        """The groups of a scene; None where nothing overlaps and nothing has a priority.
+        """The groups of a scene; None where nothing overlaps, nothing has a priority, and no glass is outside.
         `result`: what lies inside of what, the smallest holder last. `holders`: objects, then glass. `groups`: that
-        instances in the scene show.
+        instances in the scene show. `outer`: the numbers of glass outside.
 
         Raises:
             ValueError: a group has more than MOST things, an open one, glass that is no dielectric, or a delta light.
@@ -77,6 +77,7 @@ class Priorities:
         ends = np.array([edge[:2] for edge in edges], dtype=int).reshape(-1, 2)
         label = connected_components(coo_array((np.ones(len(ends)), ends.T), shape=(n, n)), directed=False)[1]
         needed = {label[a] for a, b, whole in edges if not whole or own[a] is not None or own[b] is not None}
+        needed |= {label[k] for k in outer}
         if not needed:
             return None
 
@@ -106,7 +107,8 @@ class Priorities:
         for group in members:
             for bit, k in enumerate(group):
                 rows["bit"][k], rows["first"][k], rows["boundary"][k] = 1 << bit, len(inside), len(made)
-                made += [with_index(boundaries[k], eta[k] / around) for around in (1.0, *(eta[j] for j in group))]
+                others = (1.0, *(1.0 if j == k else eta[j] for j in group))  # never behind itself
+                made += [with_index(boundaries[k], eta[k] / around) for around in others]
             inside += [k if k < objects else OUTSIDE for k in group]
         tables = {key: mi.UInt32(row.tolist()) for key, row in rows.items()}
         tables["object"] = mi.Int32(inside)

@@ -164,6 +164,21 @@ def test_a_priority_of_an_object_inside_another_gives_its_index_another_meaning_
     np.testing.assert_allclose(image(eta=1.2), image(eta=1.2 * 1.4, priority=1.0), rtol=1e-5)
 
 
+def test_an_edit_of_the_index_of_glass_over_an_object_is_seen() -> None:
+    def scene(index: float) -> mi.Scene:
+        glass = _box((-2, -2, -2), (2, 2, 0), bsdf={**GLASS, "int_ior": index})
+        return _view({"wax": _ball(1.0, bsdf={**CREAM, "priority": -1.0}), "glass": glass})
+
+    edited = scene(1.5)
+    before = np.array(mi.render(edited, spp=16, seed=1))
+    parameters = mi.traverse(edited)
+    parameters["glass.bsdf.eta"] = 1.2
+    parameters.update()
+    after = np.array(mi.render(edited, spp=16, seed=1))
+    np.testing.assert_allclose(after, np.array(mi.render(scene(1.2), spp=16, seed=1)), rtol=1e-4)
+    assert np.abs(after - before).max() > 0.01
+
+
 POINT = {"lamp": {"type": "point", "position": [0.7, 0, 0]}}
 COATED = {"type": "principled", "spec_trans": 1.0}
 

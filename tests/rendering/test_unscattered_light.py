@@ -211,6 +211,19 @@ def test_a_medium_without_absorption_is_invisible_in_uniform_light() -> None:
 
 
 @pytest.mark.slow
+def test_a_ball_in_a_bell_jar_without_absorption_is_invisible_in_uniform_light() -> None:
+    """All of its light comes by way of the glass, at which paths of light begin."""
+    jar = {**_ball(6.5), "bsdf": {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}}
+    hollow = {**_ball(6.0), "bsdf": {"type": "dielectric", "int_ior": 1.0, "ext_ior": 1.5}}
+    scene = _scene("precomputed", WHITE, light={"type": "constant"}, jar=jar, hollow=hollow)
+    means = _means(scene, 8, 2048, 1)
+    assert len(scene.integrator().media(scene).lit_from_outside) == 3
+    error = means.std(axis=0, ddof=1) / np.sqrt(len(means))
+    assert (error < 0.006).all(), error
+    assert (np.abs(means.mean(axis=0) - 1) < WIDEST_Z * error + 0.002).all(), means.mean(axis=0)
+
+
+@pytest.mark.slow
 def test_a_branching_object_without_absorption_is_invisible_in_uniform_light(tmp_path: Path) -> None:
     """A hand about 10 units wide, without interpolated normals, by z-tests beside a bias of .3 %."""
     meshes = pytest.importorskip("full_geometry.learning.meshes")
