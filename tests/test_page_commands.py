@@ -36,7 +36,7 @@ LESS = {  # what a command is given beside, by the longest of these that it star
     "train object": "--seconds 1",
     "train material": "--steps 20",
     "train material ketchup": "--channel R --fast --steps 20",
-    "trade ball.xml": "--assess 0.1",
+    "trade ball.xml": "--assess 0.1 --model better_dipole",
     "errors materials": "--events 1e5 --channel R --model better_dipole",
     "errors materials --held-out": "--events 1e5 --held-out 2",
     "errors object": "--exits 16",
@@ -84,7 +84,7 @@ import time
 
 import quick_kernels
 import quick_light
-from figures import fig09
+from figures import fig09, fig10
 from figures.command_line import main
 from figures.parts import command as figure_command
 from full_geometry.learning import model_errors as errors_of_objects
@@ -96,6 +96,7 @@ import halfspace_sss.neural.training.train_material
 
 quick_kernels.compile_quickly()
 fig09.SHOWN, fig09.MODELS, fig09.SIZES = {"draft": ("ketchup",)}, ("better_dipole",), {"draft": 24}
+fig10.WALKS["draft"], fig10.accepting = 2**14, lambda medium: ["better_dipole", "neural"]
 figure_command.MOST_WORKERS = 1  # others would import and compile for themselves
 # walks of numbers that nobody reads
 training.EXITS, training.WALKS, training.SAMPLES = 16, 256, 64
@@ -167,17 +168,25 @@ def _items(page: str) -> list[tuple[str, str]]:
     return found
 
 
+def _alike(kind: str, text: str) -> str:
+    """What a command does, whatever the number of its samples and the folder of its results."""
+    numbers = r" --(spp|quality|out) \S+"
+    again = kind == "bash" and text.startswith(("halfspace-sss render scene.xml", "halfspace-sss figures all"))
+    return re.sub(numbers, "", text) if again else text
+
+
 def _pages(top: Path) -> Iterator[tuple[str, str, str]]:
-    """Folder, kind and text of all that runs; a command without a file runs where it stands first."""
+    """Folder, kind and text of all that runs; a command without files of its page runs where it stands first."""
     ran = set()
     for page in PAGES:
         folder = top / Path(page).stem
         folder.mkdir()
         _lay_out(page, folder)
         for kind, text in _items(page):
-            if text not in ran or ".xml" in text:
+            alike = _alike(kind, text)
+            if alike not in ran or alike == text and ".xml" in text:
                 yield str(folder), kind, text
-            ran.add(text)
+            ran.add(alike)
 
 
 def _of_kind(page: str, kind: str) -> str:

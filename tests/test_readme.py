@@ -42,11 +42,17 @@ COMMANDS = list(
     )
 )
 RUN = """
+import dataclasses
 import sys
 
 import quick_kernels
+import quick_light
+from full_geometry import inverse
 
 quick_kernels.compile_quickly()
+quick_light.gather_by_few(setattr)
+fit = inverse.fit
+inverse.fit = lambda *arguments, settings: fit(*arguments, settings=dataclasses.replace(settings, steps=2))
 for number, text in enumerate(sys.argv[1:]):
     exec(compile(text, f"snippet {number}", "exec"), {"__name__": "__main__"})
     print(f"\\nend of {number}", flush=True)
