@@ -66,15 +66,6 @@ def test_it_is_the_same_number_for_every_pair_so_that_light_may_take_the_way_bac
     assert np.allclose(there, back, rtol=5e-3, atol=1e-6 * there.max())
 
 
-def test_each_channel_is_held_to_its_own_light() -> None:
-    mi.set_variant("llvm_ad_rgb")
-    medium = Medium(np.array([0.99, 0.5, 0.1]), np.array([0.01, 0.5, 0.9]), np.zeros(3), 1.3)
-    obj = ball(2.0, medium)
-    found = errors_of(obj, {"held": transport(obj)}, exits=64, walks=16384, samples=4096)
-    ratios = [row.ratio for row in found["held"] if row.light == "constant"]
-    assert len(ratios) == 3 and np.abs(np.array(ratios) - 1).max() < 0.04  # four times the noise of the darkest
-
-
 def test_the_same_object_is_held_by_the_same_numbers() -> None:
     one, other = (transport(ball(3.0)).scales for _ in range(2))
     assert one == other

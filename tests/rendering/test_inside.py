@@ -142,9 +142,6 @@ LIGHTS: dict[str, Callable[[], tuple[dict, dict[str, str]]]] = {
     "led in a bubble": lambda: (
         {"air": _ball(0.8, bsdf=AIR), "led": _ball(0.3, PLACE, bsdf=BLACK, emitter=LED)}, {"air": "wax"}
     ),
-    "led in frosted glass": lambda: (
-        {"glass": _ball(0.8, bsdf=FROSTED), "led": _ball(0.3, PLACE, bsdf=BLACK, emitter=LED)}, {"glass": "wax"}
-    ),
     "glowing stone in a second medium": lambda: (
         {"seed": _ball(0.8, bsdf=SEED), "stone": _ball(0.3, PLACE, bsdf=GREY, emitter=LED)}, {"seed": "wax"}
     ),

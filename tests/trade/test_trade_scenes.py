@@ -223,14 +223,6 @@ def test_a_way_that_refuses_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert "must be trained" in found.way("full_geometry").refusal
 
 
-def test_precomputed_light_of_walks_has_less_variance_and_no_bias_beside_its_noise() -> None:
-    on = stage(scene(light={"type": "envmap", "bitmap": mi.Bitmap(windows())}))
-    found = assess_stage(on, [WALKS, PRECOMPUTED_WALKS], Effort(samples=1024, exits=64)).objects[0]
-    row = found.way("path_traced, precomputed")
-    assert abs(row.bias2) < 4 * row.bias2_error < 0.1**2 and row.preparation > 0
-    assert row.variance + 4 * row.variance_error < 0.5 * found.traced.variance
-
-
 def test_walks_refuse_to_precompute_light_where_that_cannot_be() -> None:
     ways = [WALKS, PRECOMPUTED_WALKS]
     found = assess_stage(stage(scene(orders="multiple")), ways, Effort(samples=48, exits=32)).objects[0]
