@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.geometry.instances import InstanceScene, bounds_of
+from full_geometry.geometry.instances import InstanceScene, bounds_of, shapes_of
 from full_geometry.geometry.points import floats
 from full_geometry.geometry.rounding import ray_from
 from full_geometry.geometry.sensors import independent, seeded
@@ -262,7 +262,8 @@ def _recorded(scene: mi.Scene, integrator: mi.Integrator, sampler: mi.Sampler, r
 
 
 # --------------------------------------------------------------------------------------------------
-# Where the camera sees an object: rays to its visible points, and how much of the image they fill.
+# Where the camera sees an object: rays to its visible points, straight or through clear things such as glass about it,
+# and how much of the image they fill.
 #
 # Points in which the boundary mirrors a lamp, or through which one would be seen if the inside were clear, are left
 # out: by chance the few of them that are drawn would decide all means.
@@ -270,12 +271,14 @@ def _recorded(scene: mi.Scene, integrator: mi.Integrator, sampler: mi.Sampler, r
 
 LAUNCH, LAUNCHES = 2**16, 16  # rays of a look at the scene, and the most looks for an object that is hardly seen
 FEWEST_EXITS = 32  # exits of an object that is assessed
+CLEAR = mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.Null
+MOST_CLEAR = 6  # boundaries of clear things before an object
 CHAIN = 4  # boundaries that light of a lamp may meet without scattering, mirrored by all or passing through
 
 
 @dataclass(frozen=True, eq=False)
 class Exits:
-    """Rays of the camera that meet an object first.
+    """Rays of the camera that see an object.
     `o`, `d`: origins and directions, float32 (3, n). `share`: of the image that the object fills. `pixels`: of the film
     that it fills."""
 
@@ -303,7 +306,7 @@ class Exits:
 
 
 def visible_exits(scene: mi.Scene, shapes: list[mi.Shape], sensor: int, n: int, seed: int) -> list[Exits | None]:
-    """Find n rays of a sensor that meet each shape first; fewer where it is hardly seen, None where it is not.
+    """Find n rays of a sensor that see each shape; fewer where it is hardly seen, None where it is not.
     `n`: rays of each."""
     camera = scene.sensors()[sensor]
     pixels = int(np.prod(np.array(camera.film().crop_size())))
@@ -328,17 +331,34 @@ def visible_exits(scene: mi.Scene, shapes: list[mi.Shape], sensor: int, n: int, 
 def _look(
     scene: mi.Scene, camera: mi.Sensor, shapes: list[mi.Shape], seed: tuple[int, int]
 ) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Random rays of a camera, (6, LAUNCH), evenly over its film, and which of them meet each shape first."""
+    """Random rays of a camera, (6, LAUNCH), evenly over its film, and which of them see each shape."""
     rng = np.random.default_rng([*seed, 23])
     rows = rng.random((5, LAUNCH))
     rows[1:3] = (rows[1:3, :1] + np.arange(LAUNCH) * np.array(R_2)[:, None]) % 1
     u = [floats(row) for row in np.minimum(rows, 1 - 2**-24)]
     ray, _ = camera.sample_ray_differential(camera.shutter_open(), u[0], mi.Point2f(*u[1:3]), mi.Point2f(*u[3:]))
-    si = scene.ray_intersect(mi.Ray3f(ray), mi.RayFlags.All, coherent=False)
+    si = _seen(scene, shapes, scene.ray_intersect(mi.Ray3f(ray), mi.RayFlags.All, coherent=False))
     plain = si.is_valid() & ~(_shows_lamp(scene, shapes, si, False) | _shows_lamp(scene, shapes, si, True))
     hit = [np.array((si.shape == mi.ShapePtr(shape)) & plain) for shape in shapes]
     columns = np.concatenate([np.array(v, dtype=np.float32).reshape(3, -1) for v in (ray.o, ray.d)])
     return np.broadcast_to(columns, (6, LAUNCH)) if columns.shape[1] == 1 else columns, hit
+
+
+def _seen(scene: mi.Scene, shapes: list[mi.Shape], si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
+    """What is seen where a ray has met something: this, or what is behind clear things that are none of the shapes."""
+    clear = [shape for shape in shapes_of(scene, ()) if not surface_of(shape) and shape.bsdf().flags() & CLEAR]
+    ctx = mi.BSDFContext()
+    ctx.type_mask = CLEAR
+    for _ in range(MOST_CLEAR if clear else 0):
+        # refraction, or the way straight on, by what is clear
+        through = mi.Bool(False)
+        for shape in clear:
+            through |= si.is_valid() & (si.shape == mi.ShapePtr(shape))
+        bs, _ = si.bsdf().sample(ctx, si, 0.5, mi.Point2f(0.5), through)
+        through &= bs.pdf > 0
+        behind = scene.ray_intersect(si.spawn_ray(si.to_world(bs.wo)), mi.RayFlags.All, False, through)
+        si = dr.select(through, behind, si)
+    return si
 
 
 def _shows_lamp(scene: mi.Scene, shapes: list[mi.Shape], si: mi.SurfaceInteraction3f, through: bool) -> mi.Bool:

@@ -171,6 +171,16 @@ def test_an_object_behind_another_is_refused_in_a_sentence() -> None:
     assert found.way is None and "hardly seen by the camera" in str(found)
 
 
+def test_an_object_in_a_ball_of_glass_is_seen_through_it() -> None:
+    """As wide as by its index."""
+    glass = {"type": "sphere", "radius": 1.5, "bsdf": {"type": "dielectric", "int_ior": 1.1, "ext_ior": 1.0}}
+    (bare,), (found,) = (
+        visible_exits(on.scene, on.shapes, 0, 32, 0)
+        for on in (stage(scene()), stage({**scene(), "glass": {**scene()["ball0"], **glass}}))
+    )
+    assert found.share / bare.share == pytest.approx(1.21, rel=0.02)
+
+
 def test_an_instance_is_refused_in_a_sentence() -> None:
     group = {"type": "shapegroup", "ball": scene()["ball0"]}
     instanced = {**scene(), "group": group, "one": {"type": "instance", "g": {"type": "ref", "id": "group"}}}
