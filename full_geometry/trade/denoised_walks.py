@@ -36,6 +36,7 @@ from full_geometry.objects.objects import translucent_shapes
 from full_geometry.trade.denoising import GUIDE_SPP, GUIDES, denoised, guides_of
 from full_geometry.trade.images import film_of, pixel_means, pixels_of
 from full_geometry.trade.results import DOUBT, TechniqueTrade
+from full_geometry.trade.sampling import seen_through
 from full_geometry.trade.statistics import Number
 from full_geometry.trade.techniques import Effort, Stage, Technique
 from halfspace_sss.backend import clock
@@ -263,7 +264,7 @@ def _aovs_of(scene: mi.Scene) -> Callable[..., list[mi.Float]]:
 
     def traced(sampler: mi.Sampler, ray: mi.Ray3f, weight: mi.Spectrum) -> list[mi.Float]:
         aovs = integrator.sample(scene, sampler, mi.RayDifferential3f(ray), None, mi.Bool(True))[2]
-        si = scene.ray_intersect(ray)
+        si = seen_through(scene, shapes, scene.ray_intersect(ray))
         return [*aovs, *(dr.select(si.is_valid() & (si.shape == mi.ShapePtr(each)), mi.Float(1), 0) for each in shapes)]
 
     return traced

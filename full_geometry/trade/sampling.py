@@ -337,14 +337,14 @@ def _look(
     rows[1:3] = (rows[1:3, :1] + np.arange(LAUNCH) * np.array(R_2)[:, None]) % 1
     u = [floats(row) for row in np.minimum(rows, 1 - 2**-24)]
     ray, _ = camera.sample_ray_differential(camera.shutter_open(), u[0], mi.Point2f(*u[1:3]), mi.Point2f(*u[3:]))
-    si = _seen(scene, shapes, scene.ray_intersect(mi.Ray3f(ray), mi.RayFlags.All, coherent=False))
+    si = seen_through(scene, shapes, scene.ray_intersect(mi.Ray3f(ray), mi.RayFlags.All, coherent=False))
     plain = si.is_valid() & ~(_shows_lamp(scene, shapes, si, False) | _shows_lamp(scene, shapes, si, True))
     hit = [np.array((si.shape == mi.ShapePtr(shape)) & plain) for shape in shapes]
     columns = np.concatenate([np.array(v, dtype=np.float32).reshape(3, -1) for v in (ray.o, ray.d)])
     return np.broadcast_to(columns, (6, LAUNCH)) if columns.shape[1] == 1 else columns, hit
 
 
-def _seen(scene: mi.Scene, shapes: list[mi.Shape], si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
+def seen_through(scene: mi.Scene, shapes: list[mi.Shape], si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
     """What is seen where a ray has met something: this, or what is behind clear things that are none of the shapes."""
     clear = [shape for shape in shapes_of(scene, ()) if not surface_of(shape) and shape.bsdf().flags() & CLEAR]
     ctx = mi.BSDFContext()
