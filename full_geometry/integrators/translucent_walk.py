@@ -305,7 +305,7 @@ def _prepared(scene: mi.Scene, before: tuple, mm_per_unit: float) -> tuple[Scene
     shapes = scene.shapes()  # the scene itself, which holds its integrator, would never be freed
     mark, places = SceneMark(scene), places_of(scene)
     same = before[0] == mark and same_objects(before[1], shapes) and before[2] == places
-    if before[3] is not None and same and before[3].is_current():
+    if before[3] is not None and same and before[3].is_current(scene):
         return before
 
     # ---- media anew, and warnings of cameras inside objects and of doubtful units

@@ -68,6 +68,7 @@ class InclusionTable:
             about objects, which their light passes.
         priorities: of what overlaps, and of glass outside; None where there is neither.
         surfaces: snapshots of the BSDFs of glass with priorities.
+        outer: the glass outside.
     """
 
     scene: mi.Scene
@@ -77,6 +78,7 @@ class InclusionTable:
     glass: list[Geometry]
     priorities: Priorities | None = None
     surfaces: Sequence[Snapshot] = ()
+    outer: Sequence[Geometry] = ()
 
     @classmethod
     def of(cls, scene: mi.Scene, objects: list[Geometry]) -> InclusionTable | None:
@@ -140,10 +142,14 @@ class InclusionTable:
         dr.make_opaque(tables)
         lights = [(light, k) for light, k in lights.values() if is_delta(light) and k >= 0]
         surfaces = [] if priorities is None else [Snapshot(piece.shape.bsdf()) for piece in glass]
-        return cls(instance_table.scene(scene), instance_table, tables, lights, glass, priorities, surfaces)
+        return cls(instance_table.scene(scene), instance_table, tables, lights, glass, priorities, surfaces, outer)
 
-    def is_current(self) -> bool:
-        """Whether glass that overlaps still has the index and roughness that boundaries were made of."""
+    def is_current(self, scene: mi.Scene) -> bool:
+        """Whether glass still has the index and roughness that boundaries were made of, and no camera inside."""
+        try:
+            check_sensors(scene, list(self.outer))
+        except ValueError:
+            return False
         return all(Snapshot(piece.shape.bsdf()) == was for piece, was in zip(self.glass, self.surfaces))
 
     @property
@@ -485,11 +491,11 @@ class WalkMedia:
         heterogeneous = HeterogeneousMedia.of(specs, self.objects, self.mm_per_unit) if varies else None
         object.__setattr__(self, "heterogeneous", heterogeneous)
 
-    def is_current(self) -> bool:
-        """Whether the objects still have the shapes and the media that this was made of."""
+    def is_current(self, scene: mi.Scene) -> bool:
+        """Whether objects of a scene still have the shapes and the media that this was made of."""
         pairs = zip(self.objects, self.specs)
         same = all(inside is surface_of(obj.shape).spec and obj.is_current() for obj, inside in pairs)
-        return same and (self.inner is None or self.inner.is_current())
+        return same and (self.inner is None or self.inner.is_current(scene))
 
     def renewed(self) -> WalkMedia | None:
         """The same shapes with the media that they have now; None if they moved, or hold or are around something."""

@@ -179,6 +179,19 @@ def test_an_edit_of_the_index_of_glass_over_an_object_is_seen() -> None:
     assert np.abs(after - before).max() > 0.01
 
 
+def test_a_camera_that_moves_into_a_bell_jar_sees_its_glass() -> None:
+    """What is in a jar is known by the glass that rays have passed, so that none may begin in there."""
+    jar = {"jar": _ball(2.0, bsdf=GLASS), "hollow": _ball(1.9, bsdf=_between(1.5, 1.0)), "wax": _ball(0.5, bsdf=CREAM)}
+    inside = mi.ScalarTransform4f().look_at([0, -1.5, 0], [0, 1, 0.9], [0, 0, 1])
+    moved, fresh = (_view(jar) for _ in range(2))
+    mi.render(moved, spp=1)
+    for scene in (moved, fresh):
+        parameters = mi.traverse(scene)
+        parameters["cam.to_world"] = inside
+        parameters.update()
+    np.testing.assert_allclose(*(np.array(mi.render(scene, spp=4, seed=1)) for scene in (moved, fresh)), rtol=1e-4)
+
+
 POINT = {"lamp": {"type": "point", "position": [0.7, 0, 0]}}
 COATED = {"type": "principled", "spec_trans": 1.0}
 
