@@ -168,9 +168,9 @@ def _with_paths(
     D = dr.zeros(mi.Float, 2 * n * slots)
     dr.eval(D)
     tracer = ScatteredLight(scene, media, light.index, light.tables, D, slots)
-    # by the flux that reaches each object or piece of glass
+    # by the flux that reaches each object or piece of glass, where there are several
     starts = media.lit_from_outside
-    flux = np.array([tracer.flux(k, seed) for k in starts])
+    flux = np.array([tracer.flux(k, seed) for k in starts] if len(starts) > 1 else [1.0])
     for k, share in zip(starts, flux / max(flux.sum(), 1e-30)):
         tracer.trace(k, max(int(share * paths), FEWEST_PATHS), seed)
 

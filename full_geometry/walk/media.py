@@ -86,8 +86,11 @@ class InclusionTable:
         ValueError if something inside that refracts is not closed, objects count some orders only, or as of
         `Priorities.of`."""
         outer = _glass_outside(scene, objects)
-        with contextlib.suppress(ValueError):  # of glass that can be no member: light by way of it is left to chance
+        try:
             return cls._of(scene, objects, outer)
+        except ValueError:  # of glass that can be no member: light by way of it is left to chance
+            if not outer:
+                raise
         return cls._of(scene, objects, [])
 
     @classmethod
@@ -116,9 +119,7 @@ class InclusionTable:
 
         # ---- what is around each: the smallest holder comes last and stays
         around, lights, result = np.full(len(instance_table), -1), {}, _largest_first(result, holders)
-        outside = {
-            int(first) for shape, first in zip(holders.shapes, holders.first) if any(shape is o.shape for o in outer)
-        }
+        outside = range(len(own), len(own) + len(outer))  # of glass the first, each at one place
         priorities = Priorities.of(scene, result, holders, objects, groups, outside)
         holding, held = np.zeros(len(own), dtype=bool), np.zeros(len(instance_table), dtype=bool)
         for inclusion in result:
@@ -201,7 +202,7 @@ def _glass_outside(scene: mi.Scene, objects: list[Geometry]) -> list[Geometry]:
     for shape in scene.shapes():
         box = shape.bbox()
         about = ((low > np.array(box.min)) & (high < np.array(box.max))).all(axis=1).any()
-        if not about or not _displaces(shape) or shape.bsdf().class_name() not in DIELECTRICS:
+        if not about or shape.bsdf().class_name() not in DIELECTRICS:
             continue
         with warnings.catch_warnings(), contextlib.suppress(ValueError):  # of a sheet, or a camera inside
             warnings.simplefilter("ignore")

@@ -59,7 +59,7 @@ class Priorities:
     @classmethod
     def of(
         cls, scene: mi.Scene, result: list[Inclusion], holders: InstanceTable, objects: list[Geometry],
-        groups: list[Group], outer: set[int],
+        groups: list[Group], outer: range,
     ) -> Priorities | None:  # fmt: skip
         """The groups of a scene; None where nothing overlaps, nothing has a priority, and no glass is outside.
         `result`: what lies inside of what, the smallest holder last. `holders`: objects, then glass. `groups`: that
