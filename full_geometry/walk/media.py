@@ -777,6 +777,7 @@ class WalkMedia:
         # boundary, and wi in it
         n = dr.select(k >= 0, si.n * self.side(dr.maximum(k, 0), si.prim_index), si.n)
         flip = (k >= 0) & (dr.dot(si.sh_frame.n, n) < 0)
+        si = mi.SurfaceInteraction3f(si)  # that of the caller stays as it is: turned twice it would point inwards
         si.n, frame = n, si.sh_frame
         si.sh_frame = dr.select(flip, mi.Frame3f(frame.s, -frame.t, -frame.n), frame)
         si.wi = si.to_local(-direction)

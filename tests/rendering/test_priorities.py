@@ -147,6 +147,18 @@ def test_an_even_sky_stays_even_over_overlaps_that_absorb_nothing() -> None:
     assert abs(found.mean() - 1) < 5e-4
 
 
+@pytest.mark.parametrize("light", ["precomputed", "sampled"])
+def test_an_object_whose_normals_point_inwards_looks_the_same_beside_an_overlap(light: str) -> None:
+    def image(**turned: bool) -> np.ndarray:
+        things = {"a": _ball(0.5, (-0.3, 0, 0.5), bsdf=CREAM), "b": _ball(0.5, (0.1, 0, 0.5), bsdf=JELLY)}
+        things["beside"] = {**_ball(0.8, (0, 0, -0.9), bsdf=CREAM), **turned}
+        return np.array(
+            mi.render(_view(things, integrator={"type": "translucent_walk", "light": light}), spp=64, seed=1)
+        )
+
+    np.testing.assert_allclose(image(flip_normals=True).mean(), image().mean(), rtol=0.02)
+
+
 def test_the_later_of_equal_priorities_wins() -> None:
     def image(**first: float) -> np.ndarray:
         things = {"a": _ball(1.0, (-0.5, 0, 0), bsdf={**JELLY, **first}), "b": _ball(1.0, (0.5, 0, 0), bsdf=CREAM)}
