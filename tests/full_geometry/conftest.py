@@ -12,13 +12,14 @@ from halfspace_sss.neural import store
 
 @pytest.fixture(scope="module", autouse=True)
 def fewer_walks() -> Iterator[None]:
-    """A noisier truth of trainings than by default: a quarter of the walks."""
+    """Noisier errors of trainings than by default: a quarter of the walks and of the entries."""
     pytest.importorskip("mitsuba")
     pytest.importorskip("torch")
     from full_geometry.learning import training
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training, "WALKS", 512)
+        patch.setattr(training, "SAMPLES", 128)
         yield
 
 

@@ -47,7 +47,7 @@ from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 pytestmark = pytest.mark.usefixtures("rgb")
 
 BUNNY = Path(__file__).parents[2] / "figures" / "assets" / "bunny.ply"
-QUICK = Recipe(width=32, depth=2, batch=1024, chunk=2**15, reuse=4)
+QUICK = Recipe(width=32, depth=2, batch=512, chunk=2**14, reuse=2)
 CHUNKS, PASSES = 6, 6
 COLOURS = {"sigma_s": "0.95,0.8,0.6", "sigma_a": "0.05,0.2,0.4", "eta": 1.4}
 WAX = Medium(np.array([0.95, 0.8, 0.6]), np.array([0.05, 0.2, 0.4]), 0.0, 1.4)
@@ -266,7 +266,7 @@ def test_a_scene_of_another_unit_is_another_object(trained: Trained) -> None:
 
 @pytest.mark.slow
 def test_orders_below_two_and_the_others_agree_with_walks(trained: Trained) -> None:
-    obj, n = trained.model.object, 2**19
+    obj, n = trained.model.object, 2**18
     at = obj.random_points(generator(mi, n, pass_seed(3)))
     T = [trace_exits(obj, at, (4,), fewest=fewest).T for fewest in (0, 2)]
     few, more = (np.array(v) for v in trained.model.alpha(at))

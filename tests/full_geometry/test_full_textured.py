@@ -26,7 +26,7 @@ from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
-QUICK = Recipe(width=32, depth=2, batch=1024, chunk=2**15, reuse=4)
+QUICK = Recipe(width=32, depth=2, batch=512, chunk=2**14, reuse=2)
 CHUNKS, PASSES = 6, 6
 PALE, DARK = ([0.98, 0.9, 0.7], [2.0, 3.0, 4.0]), ([0.5, 0.7, 0.95], [4.0, 3.0, 2.0])  # albedo, sigma_t
 

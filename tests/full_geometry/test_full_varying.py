@@ -32,7 +32,7 @@ from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 pytestmark = pytest.mark.usefixtures("rgb")
 
 BUNNY = Path(__file__).parents[2] / "figures" / "assets" / "bunny.ply"
-QUICK = Recipe(width=32, depth=2, batch=1024, chunk=2**15, reuse=4)
+QUICK = Recipe(width=32, depth=2, batch=512, chunk=2**14, reuse=2)
 CHUNKS, PASSES = 5, 6
 RNG = np.random.default_rng(3)
 DENSITY = 8.0 ** -RNG.random((4, 4, 4, 1))

@@ -180,7 +180,7 @@ def test_it_has_the_mean_of_walks_through_a_rough_boundary_within_1_percent_wher
     scene: Any,
 ) -> None:
     frosted = {**MEDIUM, "b": {"type": "roughdielectric", "alpha": 0.4, "int_ior": 1.4, "ext_ior": 1.0}}
-    walks = np.array([_image(_scene("precomputed", frosted, _lamp()), 1024, seed) for seed in (1, 2, 3, 4)])
+    walks = np.array([_image(_scene("precomputed", frosted, _lamp()), 512, seed) for seed in (1, 2, 3, 4)])
     walked, error = walks.mean(axis=(0, 1, 2)), walks.mean(axis=(1, 2)).std(axis=0, ddof=1) / 2
     gathered = _image(_with(scene, _Left()), 256).mean(axis=(0, 1))
     assert np.abs(gathered / walked - 1).max() > 0.05
@@ -285,12 +285,14 @@ def _things() -> dict:
 
 
 @pytest.mark.slow
-def test_it_takes_what_walks_take_and_has_their_means_within_1_percent() -> None:
+def test_it_takes_what_walks_take_and_has_their_means_within_1_percent(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("PER_LAUNCH", "FEWEST", "FEWEST_OF_LIGHT"):  # the noise of four is held below
+        monkeypatch.setattr(correction, name, getattr(correction, name) // 2)
     scene, walked = _in_light("bssrdf"), _in_light("translucent_walk")
     found, means = [], [_image(walked, 512, seed).reshape(2, 8, 2, 8, 3).mean(axis=(1, 3)) for seed in range(4)]
     for part in range(4):
         scene.integrator().corrections = Corrections(part)
-        found.append(_image(scene, 128, part).reshape(2, 8, 2, 8, 3).mean(axis=(1, 3)))
+        found.append(_image(scene, 64, part).reshape(2, 8, 2, 8, 3).mean(axis=(1, 3)))
     for of in (lambda x: np.array(x).mean(axis=(1, 2)), np.array):  # the image, then quarters of it
         (a, da), (b, db) = ((of(x).mean(axis=0), of(x).std(axis=0, ddof=1) / 2) for x in (found, means))
         noise, off = np.hypot(da, db) / b, np.abs(a / b - 1)

@@ -126,7 +126,7 @@ def _walked(lights: dict, orders: str, fewer: int = 1) -> np.ndarray:
     """Means of images by walks that look for no emitter."""
     chance = {"type": "translucent_walk", "light": "sampled", "connection_share": 0.0}
     scene = _scene(chance, lights, orders=orders)
-    return _means(scene, (2**15 if orders == "single" else 2**12) // fewer, 1001)
+    return _means(scene, (3 * 2**13 if orders == "single" else 2**12) // fewer, 1001)
 
 
 @cache
@@ -187,7 +187,7 @@ def _same_light_otherwise(kind: str) -> dict:
 def _sun_of_texels(sky: dict) -> dict:
     """The even sky, and a ball for the flux of what is brighter, by a sum over directions."""
     emitter = mi.load_dict({"type": "scene", "sky": sky}).emitters()[0]
-    n = 2048
+    n = 512
     mu, phi = np.meshgrid((np.arange(n) + 0.5) / n * 2 - 1, (np.arange(2 * n) + 0.5) / n * np.pi, indexing="ij")
     w = np.stack([np.sqrt(1 - mu**2) * np.cos(phi), mu, np.sqrt(1 - mu**2) * np.sin(phi)]).reshape(3, -1)
     si = dr.zeros(mi.SurfaceInteraction3f, w.shape[1])
@@ -242,10 +242,11 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Iterator[np.ndarray]:
     mi.set_variant("llvm_ad_rgb")
     register()
     folder = tmp_path_factory.mktemp("weights")
-    recipe = Recipe(width=32, depth=2, batch=1024, chunk=2**15, reuse=4)
+    recipe = Recipe(width=32, depth=2, batch=512, chunk=2**14, reuse=2)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("HALFSPACE_SSS_WEIGHTS", str(folder))
         patch.setattr(training, "WALKS", 512)
+        patch.setattr(training, "SAMPLES", 128)
         shape = mi.load_dict(_scene({"type": "bssrdf"}, {"sky": {"type": "constant"}}, orders="multiple"))
         found = training.train(shape, None, chunks=5, recipe=recipe, folder=folder)
         yield np.array([row.error + 2 * row.standard_error for row in found.errors if row.light == LIGHTS[0]])

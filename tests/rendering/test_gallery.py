@@ -46,14 +46,14 @@ def test_corrected_light_has_the_mean_of_walks_within_its_error(file: str, monke
     scene = _scene(file, "better_dipole", "corrected")
     found, _ = _mean(scene, 32, 2)
     (told,) = (float(line.split("about ")[1].split("%")[0]) / 100 for line in scene.integrator().gathered)
-    walked, error = _mean(_scene(file, "path_traced", "auto"), 48)
+    walked, error = _mean(_scene(file, "path_traced", "auto"), 48, 4)
     assert 0.01 < told < 0.25 and (error < 0.03 * walked).all()
     assert (np.abs(found - walked) < min(0.5 * told, 0.05) * walked + 4 * error).all(), (found / walked, told)
 
 
 @pytest.mark.slow
 def test_precomputed_light_of_two_media_has_the_mean_of_sampled_light() -> None:
-    (found, one), (truth, other) = (_mean(_scene("fruit", "path_traced", light), 32) for light in ("auto", "sampled"))
+    (found, one), (truth, other) = (_mean(_scene("fruit", "path_traced", light), 24) for light in ("auto", "sampled"))
     error = np.hypot(one, other)
     assert (error < 0.03 * truth).all() and (found != truth).all()
     assert (np.abs(found - truth) < 0.005 * truth + 4 * error).all(), (found / truth, error / truth)
