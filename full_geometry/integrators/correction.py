@@ -6,10 +6,12 @@ L_g what a model and `gathering` give for it, which has a bias that no time lowe
 
     L_o = L_g + a(w_o) C(x_o, w_o),    a C = E[W - L_g].
 
-C, a polynomial of w_o bent by the boundary, is smooth where the model has the detail of light. It is fitted to W - L_g
-at random places and directions (`precomputed.surface_regression`). It stays until light or objects change; more walks
-make it finer. Walks find light precomputed where that is possible (`precomputed.unscattered_light`). All other light is
-traced by the walks of the image, which end at their second event (`walk_paths`).
+C, a polynomial of w_o bent by the boundary and of what is painted there, is smooth where the model has the detail of
+light. It is fitted to W - L_g at random places and directions (`precomputed.surface_regression`). It stays until light
+or objects change; more walks make it finer. Walks find light precomputed where that is possible
+(`precomputed.unscattered_light`). All other light is traced by the walks of the image, which end at their second event
+(`walk_paths`). Where phase functions are narrow, light that has turned forwards alone is as narrow, and no deep light:
+paths go on by the share Π (1 - q) of their turns (`precomputed.forward_scattering`), and walks have the rest of it.
 
 No model knows what lies inside an object, what overlaps it, or where its instances stand: L_g is then 0 and a that of
 the reflectance of the medium, so that C is all deep light.
@@ -36,7 +38,14 @@ from full_geometry.integrators.inner_light import cut_to_next
 from full_geometry.integrators.walk_paths import PathTracer
 from full_geometry.objects.objects import TranslucentObject
 from full_geometry.precomputed.lit_points import R_4, entries, to_world
-from full_geometry.precomputed.surface_regression import ResidualSums, directional, levels, smooth_field
+from full_geometry.precomputed.surface_regression import (
+    TERMS,
+    ResidualSums,
+    directional,
+    levels,
+    painted,
+    smooth_field,
+)
 from full_geometry.precomputed.transport_matrix import Albedo, bent, count_of
 from full_geometry.settings import Settings
 from full_geometry.surface.varying import equivalent
@@ -65,7 +74,7 @@ class SurfaceCorrection:
     Args:
         gathered: light that is corrected.
         area: of the object.
-        halves: sums of independent residuals.
+        halves: sums of independent residuals, of all channels together, or of each where textures part their factors.
         launches: of walks that they are of.
         values: C at the points times `scale_of` the light, (points, channels, terms).
         error: RMS of the light over its mean, as far as `surface_regression` tells it.
@@ -73,7 +82,7 @@ class SurfaceCorrection:
 
     gathered: Gathered
     area: float
-    halves: tuple[ResidualSums, ResidualSums]
+    halves: tuple[list[ResidualSums], list[ResidualSums]]
     launches: int
     values: np.ndarray
     error: float
@@ -81,23 +90,27 @@ class SurfaceCorrection:
     @property
     def walks(self) -> int:
         """How many walks it is of, without those whose place is not on the object or has no point near it."""
-        return int(sum(half.number.sum() for half in self.halves))
+        return int(sum(half[0].number.sum() for half in self.halves))
 
     @classmethod
     def of(
-        cls, gathered: Gathered, area: float, halves: tuple[ResidualSums, ResidualSums], launches: int
+        cls, gathered: Gathered, area: float, halves: tuple[list[ResidualSums], list[ResidualSums]], launches: int
     ) -> SurfaceCorrection:
         """The regression of residuals."""
         points = gathered.points
         p, n = (np.array(v, dtype=float).T for v in (points.p, points.n))
         B = np.array(gathered.values, dtype=float).reshape(len(points), -1, gathered.terms)
-        G = B[:, :, 0].mean(axis=1)
-        G = (G - G.mean()) / max(float(G.std()), 1e-12 + 1e-3 * float(np.abs(G).mean()))
-        found = levels(p, n, area, float(sum(half.number.sum() for half in halves)))
-        C, squared = smooth_field(found, p, G, halves)
-        # RMS over points, over the mean of all light that leaves
-        whole = np.square((halves[0] + halves[1]).mean).sum()
-        return cls(gathered, area, halves, launches, C, float(np.sqrt(squared.mean() / whole)) if whole > 0 else 0.0)
+        found = levels(p, n, area, float(sum(half[0].number.sum() for half in halves)))
+        C, squared, whole = [], 0.0, 0.0
+        for parts, known in zip(zip(*halves), np.array_split(B[:, :, 0], len(halves[0]), axis=1)):
+            G = known.mean(axis=1)
+            G = (G - G.mean()) / max(float(G.std()), 1e-12 + 1e-3 * float(np.abs(G).mean()))
+            field, lost = smooth_field(found, p, G, parts)
+            C.append(field)
+            # RMS over points, over the mean of all light that leaves
+            squared, whole = squared + lost.mean(), whole + np.square((parts[0] + parts[1]).mean).sum()
+        error = float(np.sqrt(squared / whole)) if whole > 0 else 0.0
+        return cls(gathered, area, halves, launches, np.concatenate(C, axis=1), error)
 
     @property
     def corrected(self) -> Gathered:
@@ -206,7 +219,8 @@ class Corrections:
                 for launch in range(first, launches):
                     checkpoint()
                     seed = SEED + 10_000 * k + 1_000_000 * self._part + launch
-                    halves[launch % 2] += residuals(tracer, k, gathered[k], seed)
+                    found = residuals(tracer, k, gathered[k], seed)
+                    halves[launch % 2] = [a + b for a, b in zip(halves[launch % 2], found)]
                 area = known.area if known else area_of(media, k)
                 self._known[k] = SurfaceCorrection.of(gathered[k], area, tuple(halves), launches)
             outgoing = OutgoingLight.of(media, [known and known.corrected for known in self._known])
@@ -278,12 +292,20 @@ def _check(obj: TranslucentObject, settings: Settings, alone: bool) -> None:
         raise ValueError(f"light of object {obj.geometry.name} must be sampled, got corrected: {reason}")
 
 
-def _nothing(gathered: Gathered) -> list[ResidualSums]:
-    return [ResidualSums.zeros(len(gathered.points), dr.size_v(mi.Spectrum))] * 2
+def _nothing(gathered: Gathered) -> list[list[ResidualSums]]:
+    terms = TERMS if gathered.object.textured is None else TERMS + len(painted(0))
+    parts = [ResidualSums.zeros(len(gathered.points), len(part), terms) for part in _channels_together(gathered)]
+    return [parts, parts]
 
 
-def residuals(tracer: PathTracer, k: int, gathered: Gathered, seed: int) -> ResidualSums:
-    """W - L_g of object k at `PER_LAUNCH` random places and directions, summed by points.
+def _channels_together(gathered: Gathered) -> list[np.ndarray]:
+    """Channels that are fitted together, as their factors are alike: all, but each alone where textures part them."""
+    channels = np.arange(dr.size_v(mi.Spectrum))
+    return [channels] if gathered.object.textured is None else list(channels[:, None])
+
+
+def residuals(tracer: PathTracer, k: int, gathered: Gathered, seed: int) -> list[ResidualSums]:
+    """W - L_g of object k at `PER_LAUNCH` random places and directions, summed by points, of all channels or of each.
 
     Args:
         tracer: of deep light.
@@ -310,14 +332,14 @@ def residuals(tracer: PathTracer, k: int, gathered: Gathered, seed: int) -> Resi
 
     # ---- W of a walk, and L_g = a B
     W, _, _ = tracer.trace(ray, PATH_LANES, (seed,))
-    a = gathered.factor(out, met)
+    a, R = gathered.factor(out, met), gathered.reflectance(out)
     r = W - gathered.radiance(out, met)
     point, near = gathered.points.nearest(out.p, out.n, met)
     bent_w = bent(out.w, out.n_out, gathered.albedo.eta)
     mu = dr.dot(bent_w, out.n_out)
     lanes = dr.zeros(mi.Float, PER_LAUNCH)
-    a, r, W = mi.Spectrum(a) + lanes, mi.Spectrum(r) + lanes, mi.Spectrum(W) + lanes
-    dr.eval(a, r, W, point, near, bent_w, mu)
+    a, r, W, R = (mi.Spectrum(v) + lanes for v in (a, r, W, R))
+    dr.eval(a, r, W, R, point, near, bent_w, mu)
 
     if not dr.all(dr.isfinite(dr.sum(r)))[0]:
         raise ValueError(
@@ -326,11 +348,17 @@ def residuals(tracer: PathTracer, k: int, gathered: Gathered, seed: int) -> Resi
 
     # ---- sums over the residuals of each point
     kept = np.array(near) & (np.array(a).min(axis=0) > LEAST_ALBEDO)
-    a, r, W, bent_w = (np.array(v, dtype=float)[:, kept].T for v in (a, r, W, bent_w))
+    a, r, W, R, bent_w = (np.array(v, dtype=float)[:, kept].T for v in (a, r, W, R, bent_w))
     a = a / scale_of(gathered)
     r = _steadied(r, a)
     Y = np.stack(directional(*bent_w.T, np.array(mu, dtype=float)[kept]), axis=1)
-    return ResidualSums.of(np.array(point)[kept], Y, a, r, W, len(gathered.points))
+    point, number = np.array(point)[kept], len(gathered.points)
+    if gathered.object.textured is None:
+        return [ResidualSums.of(point, Y, a, r, W, number)]
+    return [
+        ResidualSums.of(point, np.column_stack([Y, *painted(R[:, c])]), a[:, c], r[:, c], W[:, c], number)
+        for c in _channels_together(gathered)
+    ]
 
 
 def _bare(media: WalkMedia, beyond: mi.SurfaceInteraction3f, w: mi.Vector3f) -> mi.Bool:

@@ -34,7 +34,7 @@ from full_geometry.integrators.surface_paths import trace_paths
 from full_geometry.objects.objects import TranslucentObject
 from full_geometry.precomputed.inner import Events, InnerLight, has_inner_light
 from full_geometry.precomputed.point_pairs import Rays
-from full_geometry.precomputed.surface_regression import TERMS, directional
+from full_geometry.precomputed.surface_regression import directional, painted
 from full_geometry.precomputed.transport_matrix import (
     SEED,
     Albedo,
@@ -69,7 +69,8 @@ class Gathered:
         object: that the light leaves.
         points: where B is known.
         albedo: a(mu).
-        values: B of all points, for each channel the first terms of `directional` in w_o bent by the boundary.
+        values: B of all points, for each channel the first terms of `directional` in w_o bent by the boundary, or all
+            and those of `painted`.
         inner: at events of order 1 inside; None where that order is traced.
         matrix: transport matrix of the model; None without one.
         light: that arrives, less c.
@@ -89,20 +90,26 @@ class Gathered:
 
     @property
     def terms(self) -> int:
-        """Terms of `directional` for each channel of a point."""
+        """Terms for each channel of a point."""
         return dr.width(self.values) // (len(self.points) * dr.size_v(mi.Spectrum))
+
+    def with_terms(self, terms: int) -> mi.Float:
+        """The values, with zeros for further terms."""
+        if terms == self.terms:
+            return self.values
+        rows = np.array(self.values).reshape(-1, self.terms)
+        return floats(np.pad(rows, ((0, 0), (0, terms - self.terms))))
 
     def radiance(self, out: SurfacePoint, active: mi.Bool) -> mi.Spectrum:
         """L_o of an exit; 0 below the horizon."""
-        B = _blended(self.points, self.values, self.terms, out, self.albedo.eta, active)
+        B = _blended(self.points, self.values, self.terms, out, self.albedo.eta, active, self.reflectance(out))
         return dr.select(active & (dr.dot(out.w, out.n_out) > 0), self.factor(out, active) * B, 0)
 
     def factor(self, out: SurfacePoint, active: mi.Bool) -> mi.Spectrum:
         """L_o / B of an exit: a(w_o) R^e, or alpha in the channels where the model knows its directional albedo."""
         mu = dr.maximum(dr.dot(out.w, out.n_out), 0)
         if self.object.transport is None:
-            g = mi.Spectrum([opaque(m.g) for m in self.object.media])
-            return self.albedo(mu) * (sent_back(dr, out.medium.albedo, g) if out.medium else 1)
+            return self.albedo(mu) * self.reflectance(out)
         paint = None if self.object.textured is None else self.object.transport.paint(out)
         a = self.albedo(mu, paint)
         if paint is not None:
@@ -112,6 +119,12 @@ class Gathered:
             return a
         known = alpha.known[1]
         return known * alpha(out, active)[1] + (1 - known) * a
+
+    def reflectance(self, out: SurfacePoint) -> mi.Spectrum:
+        """That of a half-space of the medium at an exit where textures tell it, else 1."""
+        if not out.medium:
+            return mi.Spectrum(1)
+        return sent_back(dr, out.medium.albedo, mi.Spectrum([opaque(m.g) for m in self.object.media]))
 
     @cached_property
     def error(self) -> float:
@@ -141,14 +154,14 @@ class Gathered:
 
 def _blended(
     points: SurfacePoints, values: mi.Float, terms: int, out: SurfacePoint, eta: mi.Float | float, active: mi.Bool,
-    k: mi.Int32 | None = None,
+    R: mi.Spectrum, k: mi.Int32 | None = None,
 ) -> mi.Spectrum:  # fmt: skip
-    """max(B.Y(w), 0) at an exit, B blended between points of object k, w bent by a boundary of this index."""
+    """max(B.Y(w, R), 0) at an exit, B blended between points of object k, w bent by a boundary of this index."""
     size, w = dr.size_v(mi.Spectrum), bent(out.w, out.n_out, eta)
     B = points.blend(values, terms * size, out.p, out.n, active, k)
     Y = directional(w.x, w.y, w.z, dr.dot(w, out.n_out))
     rows = [B[terms * c : terms * (c + 1)] for c in range(size)]
-    return dr.maximum(mi.Spectrum([sum(b * y for b, y in zip(row, Y)) for row in rows]), 0)
+    return dr.maximum(mi.Spectrum([sum(b * y for b, y in zip(row, [*Y, *painted(r)])) for row, r in zip(rows, R)]), 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +173,8 @@ class OutgoingLight:
         lights: of each by its number; None of those that no path enters from outside.
         known: whether there is light of an object, by its number.
         points: of all of them, joined.
-        values: B of these, for each channel the terms of `directional`.
+        values: B of these, for each channel so many terms.
+        terms: of `directional`, and of `painted` where an object has textures.
     """
 
     media: WalkMedia
@@ -168,17 +182,19 @@ class OutgoingLight:
     known: mi.Bool
     points: SurfacePoints
     values: mi.Float
+    terms: int
 
     @classmethod
     def of(cls, media: WalkMedia, lights: list[Gathered | None]) -> OutgoingLight:
-        """The light of objects, each with all terms of `directional`."""
+        """The light of objects."""
         some = [light for light in lights if light is not None]
+        terms = max(light.terms for light in some)
         none = replace(some[0].points, h=1.0, first=dr.zeros(mi.UInt32, int(some[0].points.cells.prod()) + 1))
         points = SurfacePoints.joined([none if light is None else light.points for light in lights])
-        values = dr.concat([(light or some[0]).values for light in lights])
+        values = dr.concat([(light or some[0]).with_terms(terms) for light in lights])
         known = mi.Bool([light is not None for light in lights])
         dr.make_opaque(values, known)
-        return cls(media, lights, known, points, values)
+        return cls(media, lights, known, points, values, terms)
 
     def radiance(
         self, si: mi.SurfaceInteraction3f, k: mi.Int32, w: mi.Vector3f, active: mi.Bool
@@ -186,16 +202,15 @@ class OutgoingLight:
         """Whether light that leaves object k is known, and that along w from a point with normals outwards."""
         place = self.media.place_of(k)
         active = active & dr.gather(mi.Bool, self.known, place)
-        out, L = surface_point(si.p, si.n, si.sh_frame.n, w), mi.Spectrum(0)
-        B = _blended(self.points, self.values, TERMS, out, self.media.row("eta", k), active, place)
-        # a(w) of each object, with the medium that textures have here
+        out, a, R = surface_point(si.p, si.n, si.sh_frame.n, w), mi.Spectrum(0), mi.Spectrum(1)
+        # a(w) and R of each object, with the medium that textures have here
         for kind in range(len(self.media.objects)):
             light = next((self.lights[k] for k in self.media.instance_table.numbers(kind) if self.lights[k]), None)
             if light is not None:
-                here = active & self.media.has_shape(k, kind)
-                a = light.factor(out._replace(medium=light.object.medium_at(si)), here)
-                L = dr.select(here, a * B, L)
-        return active, dr.select(dr.dot(w, out.n_out) > 0, L, 0)
+                here, at = active & self.media.has_shape(k, kind), out._replace(medium=light.object.medium_at(si))
+                a, R = dr.select(here, light.factor(at, here), a), dr.select(here, light.reflectance(at), R)
+        B = _blended(self.points, self.values, self.terms, out, self.media.row("eta", k), active, R, place)
+        return active, dr.select(active & (dr.dot(w, out.n_out) > 0), a * B, 0)
 
 
 class Gathering:

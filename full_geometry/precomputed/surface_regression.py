@@ -1,7 +1,8 @@
 """A smooth field over a surface from noisy residuals, by local regressions of several widths.
 
 Residuals r_s at places of points j in directions w_s are fitted by r = a(w) C_j . Y(w), Y the
-polynomials of w up to the second degree, and of its cosine up to the third (`directional`). About each of K centres the
+polynomials of w up to the second degree, of its cosine up to the third (`directional`), and of the reflectance of what
+is painted (`painted`). Channels whose factors a are not alike are fitted apart. About each of K centres the
 weighted least squares
 
     min Σ_j W_cj Σ_s a_s (r_s / a_s - beta . phi_js)²,    phi = ((x_j - x_c) / h, G_j - G_c, Y(w_s)),
@@ -50,6 +51,11 @@ def directional(x: Any, y: Any, z: Any, mu: Any) -> list[Any]:
     return [x * 0 + 1, x, y, z, x * x - z * z, y * y - z * z, x * y, x * z, y * z, t, t * t, t * t * t]
 
 
+def painted(R: Any) -> list[Any]:
+    """Further terms, of the reflectance R at each place, which textures change faster than places can follow: R, R²."""
+    return [R, R * R]
+
+
 @dataclass(frozen=True)
 class ResidualSums:
     """Sums over the residuals of each point.
@@ -62,9 +68,9 @@ class ResidualSums:
     light: np.ndarray
 
     @classmethod
-    def zeros(cls, points: int, channels: int) -> ResidualSums:
+    def zeros(cls, points: int, channels: int, terms: int) -> ResidualSums:
         """Sums of no residuals."""
-        return cls(np.zeros(points), np.zeros((points, TERMS, TERMS)), np.zeros((points, TERMS, channels)),
+        return cls(np.zeros(points), np.zeros((points, terms, terms)), np.zeros((points, terms, channels)),
                    np.zeros(channels))  # fmt: skip
 
     @classmethod
@@ -126,7 +132,8 @@ class Level:
         `features`: (points, 1 + U), 1 and x / size and G of each point. `sums`: of the residuals."""
         # ---- moments about each centre, of phi = (1, u, Y): Σ_j W_cj Σ_s a phi phi^T and Σ_j W_cj Σ_s a phi r / a
         N, U = features.shape
-        more, D, W = TERMS - 1, U + TERMS - 1, self.weights
+        more, W = sums.a.shape[1] - 1, self.weights
+        D = U + more
         ones, w = sums.a[:, 0, 0], sums.a[:, 0, 1:]
         uu = ones[:, None, None] * features[:, :, None] * features[:, None, :]
         uw = features[:, :, None] * w[:, None, :]
@@ -201,9 +208,9 @@ class _Directions:
 
 
 def _zonal(G: np.ndarray, sums: ResidualSums) -> np.ndarray:
-    """The field (1, G) (1, t, t², t³) that fits all residuals best, (points, terms, channels)."""
+    """The field (1, G) (1, t, t², t³, R, R²) that fits all residuals best, (points, terms, channels)."""
     # (Σ F^T a F) beta = Σ F^T r, of F = (1, G) times some of the terms
-    of, F = [0, *range(TERMS - ZONAL, TERMS)], np.column_stack([np.ones(len(G)), G])
+    of, F = [0, *range(TERMS - ZONAL, sums.a.shape[1])], np.column_stack([np.ones(len(G)), G])
     size = len(of) * F.shape[1]
     M = np.einsum("ju,jv,jab->uavb", F, F, sums.a[:, of][:, :, of]).reshape(size, size)
     v = np.einsum("ju,jac->uac", F, sums.r[:, of]).reshape(size, -1)

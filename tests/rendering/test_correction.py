@@ -191,6 +191,28 @@ def test_it_has_the_mean_of_walks_through_a_rough_boundary_within_1_percent_wher
     assert "corrected by 131072 walks" in rough.integrator().gathered[0]
 
 
+def _painted() -> dict:
+    """Tiles of two colours, of which one sends back thirty times what the other does."""
+    colours = [{"type": "rgb", "value": value} for value in ([0.95, 0.4, 0.6], [0.3, 0.9, 0.8])]
+    tiles = {"type": "checkerboard", "to_uv": mi.ScalarTransform4f().scale([6, 4, 1])}
+    return {"sigma_t": "1.2,1.4,1.1", "albedo": {**tiles, "color0": colours[0], "color1": colours[1]}, "eta": 1.4}
+
+
+def _forward() -> dict:
+    """Deep light that is narrow, as no boundary bends it and much is absorbed before it turns."""
+    return {"sigma_t": 5.0, "albedo": 0.9, "g": 0.8, "eta": 1.0}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("medium", [_painted, _forward])
+def test_its_pixels_are_those_of_walks_within_5_percent_where_tiles_or_views_change_light(medium: Any) -> None:
+    walked = _image(_scene("precomputed", medium(), _lamp()), 4096)
+    found = _image(_with(_scene("corrected", medium(), _lamp()), Corrections()), 512)
+    off = np.sqrt(np.square(found - walked).sum(axis=(0, 1)) / np.square(walked).sum(axis=(0, 1)))
+    assert (off < 0.05).all(), off
+    assert np.abs(found.mean(axis=(0, 1)) / walked.mean(axis=(0, 1)) - 1).max() < 0.025
+
+
 @pytest.fixture
 def few(monkeypatch: pytest.MonkeyPatch) -> None:
     """An eighth of the walks and of the light inside."""
@@ -213,12 +235,10 @@ def test_walks_that_are_added_have_seeds_of_their_own_however_many_were_lost(
 ) -> None:
     seeds = []
 
-    def nothing(*arguments: Any) -> ResidualSums:
+    def nothing(*arguments: Any) -> list[ResidualSums]:
         seeds.append(arguments[-1])
-        points = len(arguments[2].points)
-        return ResidualSums.of(
-            np.zeros(9, int), np.ones((9, TERMS)), np.ones((9, 3)), np.ones((9, 3)), np.ones((9, 3)), points
-        )
+        points, ones = len(arguments[2].points), np.ones((9, 3))
+        return [ResidualSums.of(np.zeros(9, int), np.ones((9, TERMS)), ones, ones, ones, points)]
 
     monkeypatch.setattr(correction, "residuals", nothing)
     for spp, launches in ((16, 2), (16, 2), (2**14, 4), (2**14, 4), (2**15, 8)):
