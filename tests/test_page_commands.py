@@ -89,13 +89,15 @@ from figures.command_line import main
 from figures.parts import command as figure_command
 from full_geometry.learning import model_errors as errors_of_objects
 from full_geometry.learning import training
-from halfspace_sss.comparison import model_errors
+from halfspace_sss.comparison import model_errors, reflectance_curves
 from halfspace_sss.maps.noisy_maps import CellGrid
 from halfspace_sss.neural.training.train_material import FAST
 import halfspace_sss.neural.training.train_material
 
 quick_kernels.compile_quickly()
-fig09.SHOWN, fig09.MODELS, fig09.SIZES = {"draft": ("ketchup",)}, ("better_dipole",), {"draft": 24}
+fig09.SHOWN, fig09.MODELS, fig09.SIZES = {"draft": ("ketchup",)}, ("better_dipole",), {"draft": 12}
+fig09.MODEL_SPP["draft"], fig09.TRUTH_SPP["draft"] = 4, 16
+reflectance_curves.evaluations_per_s.__defaults__ = (4096, 0.01)
 fig10.WALKS["draft"], fig10.accepting = 2**14, lambda medium: ["better_dipole", "neural"]
 figure_command.MOST_WORKERS = 1  # others would import and compile for themselves
 # walks of numbers that nobody reads

@@ -40,7 +40,7 @@ from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 pytestmark = pytest.mark.usefixtures("rgb")
 
 WIDEST_Z, N, UNIT = 4.0, 2**16, 3.0
-QUICK, CHUNKS, RUNS = Recipe(width=24, depth=2, batch=1024, chunk=2**14, reuse=4), 12, 12
+QUICK, CHUNKS, RUNS = Recipe(width=24, depth=2, batch=512, chunk=2**13, reuse=4), 12, 12
 SKY = {"light": {"type": "constant"}}
 
 

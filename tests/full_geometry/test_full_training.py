@@ -243,8 +243,8 @@ def test_weights_that_multiply_something_else_are_refused(trained: Trained, chan
 
 
 @pytest.mark.slow
-def test_a_moved_and_turned_mesh_is_the_same_object(tmp_path: Path) -> None:
-    model = train(mi.load_dict(bunny()), WAX, chunks=2, recipe=QUICK, folder=tmp_path).model
+def test_a_moved_and_turned_mesh_is_the_same_object(few_exits: None, tmp_path: Path) -> None:
+    model = train(mi.load_dict(bunny()), WAX, chunks=2, recipe=FEW, folder=tmp_path).model
     moved = object_of(mi.load_dict(bunny(turn=40.0, shift=3.0)), WAX)
     again = storing.load(storing.find_weights(moved, tmp_path), moved).model
     turn = mi.Transform4f().translate([3, 0, -3]).rotate([0.6, 0.8, 0], 40)
@@ -332,7 +332,7 @@ def test_a_plan_by_time_is_kept_by_the_run_that_goes_on(few_exits: None, tmp_pat
     assert record["chunks"] == planned >= 2
 
 
-def test_a_mono_variant_learns_one_channel(tmp_path: Path) -> None:
+def test_a_mono_variant_learns_one_channel(few_exits: None, tmp_path: Path) -> None:
     mi.set_variant("llvm_ad_mono")
     found = train(ball(), WAX.channel(1), chunks=2, recipe=QUICK, folder=tmp_path)
     assert len(found.errors) == 2 and all(row.error < 0.2 for row in found.errors)

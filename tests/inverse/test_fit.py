@@ -155,29 +155,30 @@ def test_weights_do_not_know_the_noise_of_an_image(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_errors_of_fits_to_noisy_images_are_those_that_are_stated(tmp_path: Path) -> None:
-    """20 fits at 10 % of noise: no bias beyond 4 standard errors, and z of an rms of 1.
+    """14 fits at 10 % of noise: no bias beyond 4 standard errors, and z of an rms of 1.
 
     The robust loss takes the weights of the relative one, and bends them.
     """
     scene, z = _scene(tmp_path), []
     image = _target(scene, 8192)
-    for seed in range(20):
+    for seed in range(14):
         noise = 1 + 0.1 * np.random.default_rng(100 + seed).standard_normal(image.shape)
         settings = inverse.FitSettings(steps=8, spp=32, loss="robust", seed=seed)
         found = inverse.fit(tmp_path / "a.xml", [GivenView.of("a", 0, image * noise)], ("albedo",), settings=settings)
         z.append((found.values["albedo"] - TRUE["albedo"]) / found.errors["albedo"])
         assert not found.is_misfit and "residuals: noise, chi-square" in found.lines()[-1]
     assert 0.8 < np.sqrt(np.square(z).mean()) < 1.2
-    assert abs(np.mean(z)) < 4 / np.sqrt(60)
+    assert abs(np.mean(z)) < 3.5 / np.sqrt(42)
 
 
 @pytest.mark.slow
 def test_albedo_and_extinction_are_found_together_from_one_noisy_view(tmp_path: Path) -> None:
     text = XML.replace('name="eta" value="1"', 'name="eta" value="1.4"').replace('value="8"', 'value="24"')
     (tmp_path / "a.xml").write_text(text)
-    image = _target(open_scene(tmp_path / "a.xml"), 8192)
+    image = _target(open_scene(tmp_path / "a.xml"), 4096)
     image = image * (1 + 0.02 * np.random.default_rng(0).standard_normal(image.shape))
-    found = inverse.fit(tmp_path / "a.xml", [GivenView.of("a", 0, image)])
+    settings = inverse.FitSettings(steps=16)
+    found = inverse.fit(tmp_path / "a.xml", [GivenView.of("a", 0, image)], settings=settings)
     assert not found.is_misfit
     for name, true in TRUE.items():
         assert found.values[name] == pytest.approx(true, rel=0.08)
@@ -225,7 +226,7 @@ def test_a_robust_loss_leaves_out_spoiled_pixels_and_has_no_bias_by_noise(tmp_pa
     spoiled[np.random.default_rng(0).random((8, 8)) < 0.1] *= 3
     errors = {}
     for image, loss in ((clean, "robust"), (spoiled, "robust"), (spoiled, "relative")):
-        settings = inverse.FitSettings(steps=24, spp=32, loss=loss)
+        settings = inverse.FitSettings(steps=16, spp=32, loss=loss)
         views = [GivenView.of("a", 0, image)]
         found = inverse.fit(tmp_path / "a.xml", views, ("albedo",), settings=settings).values["albedo"]
         errors[image is clean, loss] = np.abs(found - TRUE["albedo"]).max()
@@ -295,7 +296,7 @@ def test_exposures_of_images_are_found_and_noise_at_most_doubles_the_error(tmp_p
     noisy = [e * image * (1 + 0.01 * rng.standard_normal(image.shape)) for e, image in zip(factors, images)]
     errors = {}
     for exposure, given in ((False, images), (True, noisy)):
-        settings = inverse.FitSettings(steps=16, spp=128, exposure=exposure)
+        settings = inverse.FitSettings(steps=12, spp=128, exposure=exposure)
         views = [GivenView.of(f"view {k}", k, image) for k, image in enumerate(given)]
         found = inverse.fit(open_scene(tmp_path / "a.xml"), views, ("albedo",), model=None, settings=settings)
         errors[exposure] = np.sqrt(np.square(found.values["albedo"] - TRUE["albedo"]).mean())

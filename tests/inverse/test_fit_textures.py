@@ -76,7 +76,7 @@ def test_a_checkerboard_is_found_from_its_image(tmp_path: Path) -> None:
     i, j = np.indices((4, 4))
     true = np.where(((i + j) % 2 == 0)[..., None], [0.95, 0.9, 0.6], [0.7, 0.8, 0.9])
     views = _views(_bitmap(tmp_path, true), 2048)
-    settings = inverse.FitSettings(steps=30, spp=128, tv=0)
+    settings = inverse.FitSettings(steps=20, spp=128, tv=0)
     found = inverse.fit(_bitmap(tmp_path, np.full((4, 4, 3), 0.8)), views, ("albedo",), settings=settings)
     error = found.textures["albedo"] - true
     assert np.sqrt(np.square(error).mean()) < 0.03
@@ -232,7 +232,7 @@ def test_reflectance_path_length_and_roughness_of_a_photographed_object_explain_
     for k, place in enumerate(([0, 3, 30], [20, 0, 20], [-12, 10, 25])):
         parameters["lamp.position"] = mi.Point3f(place)
         parameters.update()
-        image = np.array(mi.render(shown, spp=512, seed=90 + k))
+        image = np.array(mi.render(shown, spp=256, seed=90 + k))
         mi.Bitmap(image).write(str(tmp_path / f"{k}.exr"))
         mi.Bitmap((image.max(axis=2, keepdims=True) > 0).astype(np.float32)).write(str(tmp_path / f"mask{k}.exr"))
         camera = {"origin": [0, 0, 40], "target": [0, 0, 0], "up": [0, 1, 0], "fov": 9}

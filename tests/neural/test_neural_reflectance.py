@@ -88,7 +88,7 @@ def test_radial_profiles_of_walks_are_met_also_where_the_boundary_is_matched() -
         medium = Medium.from_albedo(albedo, 1.0, g, eta)
         L = 1 / math.sqrt(3 * (1 - albedo) * (1 - albedo * g))
         edges = np.concatenate([[0.0], np.geomspace(0.02, 20, 13)]) * max(L, 0.3)
-        walks = trace(medium, mu_i=mu_i, n_paths=1_500_000, seed=11, radii=edges)
+        walks = trace(medium, mu_i=mu_i, n_paths=750_000, seed=11, radii=edges)
         area = math.pi * np.diff(edges**2)
         multiple, total = (walks.exitance(order).value * area for order in ("multiple", "total"))
         counts = multiple > COUNTS * walks.reflectance("multiple").value

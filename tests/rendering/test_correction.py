@@ -167,7 +167,7 @@ def scene(gathered_once: Any) -> Any:
 def test_a_medium_without_absorption_is_invisible_in_uniform_light() -> None:
     """All walks bring 1, what the model lacks is corrected whole."""
     scene = _scene("corrected", WHITE, {"sky": {"type": "constant"}}, hidden=False)
-    gathered = _image(_with(scene, _Left()), 256)
+    gathered = _image(_with(scene, _Left()), 64)
     _with(scene, Corrections()).integrator().prepare(scene, 2**22)
     corrected = _image(scene, 256)
     assert np.abs(gathered - 1).max() > 0.1
@@ -182,7 +182,7 @@ def test_it_has_the_mean_of_walks_through_a_rough_boundary_within_1_percent_wher
     frosted = {**MEDIUM, "b": {"type": "roughdielectric", "alpha": 0.4, "int_ior": 1.4, "ext_ior": 1.0}}
     walks = np.array([_image(_scene("precomputed", frosted, _lamp()), 512, seed) for seed in (1, 2, 3, 4)])
     walked, error = walks.mean(axis=(0, 1, 2)), walks.mean(axis=(1, 2)).std(axis=0, ddof=1) / 2
-    gathered = _image(_with(scene, _Left()), 256).mean(axis=(0, 1))
+    gathered = _image(_with(scene, _Left()), 64).mean(axis=(0, 1))
     assert np.abs(gathered / walked - 1).max() > 0.05
     # the mean of one correction is known to 1.2 %
     rough = _scene("corrected", frosted, _lamp())

@@ -24,6 +24,7 @@ pytestmark = pytest.mark.usefixtures("rgb")
 mi = pytest.importorskip("mitsuba")
 
 MEDIUM = {"sigma_s": "1,1.5,2", "sigma_a": ".02,.1,.3", "g": 0.3, "eta": 1.4}
+SAMPLED = 2**10  # samples of a pixel of what light is held to
 
 
 def _lights(name: str) -> dict:
@@ -77,7 +78,7 @@ def _end() -> Iterator[None]:
 def _pictures(model: str, light: str) -> tuple[np.ndarray, ...]:
     """Two independent images sampled, two gathered."""
     sampled, gathered = _scene("sampled", model, _lights(light)), _gathered(model, light)
-    return tuple(_image(scene, spp, seed) for scene, spp in ((sampled, 2**11), (gathered, 64)) for seed in (1, 2))
+    return tuple(_image(scene, spp, seed) for scene, spp in ((sampled, SAMPLED), (gathered, 64)) for seed in (1, 2))
 
 
 CASES = [("better_dipole", "lamp"), ("neural", "point"), pytest.param("better_dipole", "floor", marks=pytest.mark.slow)]
@@ -116,7 +117,7 @@ def test_textures_are_as_bright_as_the_model_sampled_on_both_sides_of_an_edge() 
     texels = {"type": "bitmap", "bitmap": mi.Bitmap(colours), "raw": True, "filter_type": "nearest"}
     painted = {"reflectance": texels, "mfp": "0.8,0.6,0.4", "g": 0.3, "eta": 1.4}
     pictures = []
-    for light, spp in (("sampled", 2**11), ("gathered", 64)):
+    for light, spp in (("sampled", SAMPLED), ("gathered", 64)):
         scene = _scene(light, lights=_lights("lamp"), surface=painted)
         pictures += [_image(scene, spp, seed) for seed in (1, 2)]
     rows = np.s_[2:5, 5:6, 6:7, 7:10]
@@ -133,7 +134,7 @@ def test_a_medium_that_varies_is_as_bright_as_the_model_sampled() -> None:
     grid["to_world"] = mi.ScalarTransform4f().scale(2).translate([-0.5, -0.5, -0.5])
     cloud = {"sigma_t": grid, "albedo": "0.98,0.9,0.8", "g": 0.3, "eta": 1.4}
     pictures = []
-    for light, spp in (("sampled", 2**11), ("gathered", 64)):
+    for light, spp in (("sampled", SAMPLED), ("gathered", 64)):
         scene = _scene(light, lights=_lights("lamp"), surface=cloud)
         pictures += [_image(scene, spp, seed).mean(axis=(0, 1)) for seed in (1, 2)]
     a, b, one, two = pictures
@@ -143,7 +144,7 @@ def test_a_medium_that_varies_is_as_bright_as_the_model_sampled() -> None:
 def test_a_sample_has_a_fiftieth_of_the_variance_at_most() -> None:
     a, b, one, two = _pictures("better_dipole", "lamp")
     inner = np.s_[3:9, 3:9]
-    sampled, gathered = ((x[inner] - y[inner]) ** 2 * spp for x, y, spp in ((a, b, 2**11), (one, two, 64)))
+    sampled, gathered = ((x[inner] - y[inner]) ** 2 * spp for x, y, spp in ((a, b, SAMPLED), (one, two, 64)))
     assert np.median(gathered / np.median(sampled)) < 1 / 50
 
 

@@ -54,14 +54,14 @@ def test_depths_are_distances_to_the_nearest_point_of_the_surface(kind: str) -> 
 
 def test_a_large_ball_reflects_what_the_same_layers_below_a_plane_do() -> None:
     scene = _scene(40.0, "skin III", type="translucent_walk")
-    image = np.array(mi.render(scene, spp=512, seed=3))
+    image = np.array(mi.render(scene, spp=256, seed=3))
     error = image.std(axis=(0, 1)) / np.sqrt(image.shape[0] * image.shape[1]) / image.mean(axis=(0, 1))
     media, thickness = read_layers("skin III")
     for c in range(3):
         layers = sss.Layers([medium.channel(c) for medium in media], thickness)
-        R, of_R = sss.trace(layers, n_paths=200_000).reflectance()
+        R, of_R = sss.trace(layers, n_paths=100_000).reflectance()
         assert abs(image[..., c].mean() / R - 1) < 0.02 + 2 * np.hypot(error[c], of_R / R)
-        assert image[..., c].mean() > 1.5 * sss.trace(media[0].channel(c), n_paths=50_000).reflectance().value
+        assert image[..., c].mean() > 1.5 * sss.trace(media[0].channel(c), n_paths=10_000).reflectance().value
 
 
 @pytest.mark.slow
