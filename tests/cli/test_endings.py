@@ -32,7 +32,7 @@ SMALL = {  # a small run of each command, and what it refuses
     "materials show": (["marble"], ["marbel"]),
     "models": ([], ["extra"]),
     "render": (["ball.xml", "--spp", "4", "--out", "o"], ["none.xml"]),
-    "trade": (["ball.xml", "--model", "better_dipole", "--assess", "0.2", "--out", "o"], ["marbel"]),
+    "trade": (["ball.xml", "--model", "better_dipole", "--assess", "0.05", "--out", "o"], ["marbel"]),
     "train material": (["--fast", "--steps", "20", "--out", "o", "--work", "o/work"], ["marbel"]),
     "train object": (["--scene", "ball.xml", "--out", "o"], ["--scene", "none.xml"]),
     "train shapes": (["--out", "o"], ["--mesh", "none.ply"]),
@@ -44,7 +44,9 @@ HARNESS = """
 import atexit, dataclasses, gc, json, os, signal, subprocess, sys
 from pathlib import Path
 import matplotlib.pyplot, pandas, scipy.interpolate, torch, zarr  # once for all runs: each is a fork
+import quick_kernels
 from halfspace_sss.cli import shared
+from halfspace_sss.comparison import reflectance_curves
 from figures import fig10
 from figures.parts import command
 from figures import app as cli
@@ -55,6 +57,8 @@ training = sys.modules["halfspace_sss.neural.training.train_material"]  # a func
 fig10.WALKS["draft"] = 2**14
 training.FAST = dataclasses.replace(FAST, n_groups=16, events=1e5, grid=CellGrid(8, 4))
 command.MOST_WORKERS = 1  # the process that is interrupted writes the files, and no other has written some by then
+quick_kernels.compile_quickly()
+reflectance_curves.evaluations_per_s.__defaults__ = (4096, 0.01)
 gc.freeze()
 
 for folder, mount, moment, arguments in json.loads(sys.argv[1]):
@@ -143,7 +147,8 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], tup
         if command not in (*NO_FILES, *LONG) or column in ("bad input", "interrupt at the start")
     }
     command = ["unshare", "-rm", sys.executable, "-c", HARNESS, json.dumps(list(runs.values()))]
-    subprocess.run(command, check=True, timeout=1800)
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    subprocess.run(command, check=True, timeout=1800, env=env)
     ended = {key: json.loads((Path(run[0]) / "ended.json").read_text()) for key, run in runs.items()}
     return {key: (str(code), messages, set(files)) for key, (code, messages, files) in ended.items()}
 
