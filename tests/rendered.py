@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+from collections.abc import Iterator
+
 import numpy as np
 
 MEDIUM = {"sigma_s": 1.0, "sigma_a": 0.2, "g": 0.3, "eta": 1.4}
@@ -43,6 +47,21 @@ def render(scene: dict, spp: int, seed: int = 1) -> np.ndarray:
     return np.array(mi.render(mi.load_dict(scene), spp=spp, seed=seed))
 
 
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """Let Dr.Jit work in one thread where tests run side by side: a second one spins between launches."""
+    import drjit as dr
+
+    threads = dr.thread_count()
+    dr.sync_thread()
+    dr.set_thread_count(1 if "PYTEST_XDIST_WORKER" in os.environ else threads)
+    try:
+        yield
+    finally:
+        dr.sync_thread()
+        dr.set_thread_count(threads)
+
+
 LANES = 2**21  # of a launch; beyond, what it takes to trace a render in Python is small
 
 
@@ -63,7 +82,10 @@ def independent(scene, n: int, spp: int, seed: int = 1, **film) -> np.ndarray:
     film = {"type": "hdrfilm", "width": beside * width, "height": height, "rfilter": {"type": "box"},
             "pixel_format": "rgb", "component_format": "float32", **film}  # fmt: skip
     batch = mi.load_dict({"type": "batch", "film": film, **{f"view{k}": sensor for k in range(beside)}})
-    images = [np.array(mi.render(scene, sensor=batch, spp=spp, seed=seed + k), dtype=float) for k in range(n // beside)]
+    with one_thread():
+        images = [
+            np.array(mi.render(scene, sensor=batch, spp=spp, seed=seed + k), dtype=float) for k in range(n // beside)
+        ]
     return np.concatenate([image.reshape(height, beside, width, -1).swapaxes(0, 1) for image in images])
 
 
