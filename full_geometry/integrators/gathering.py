@@ -121,7 +121,7 @@ class Gathered:
         return known * alpha(out, active)[1] + (1 - known) * a
 
     def reflectance(self, out: SurfacePoint) -> mi.Spectrum:
-        """That of a half-space of the medium at an exit where textures tell it, else 1."""
+        """Reflectance of a half-space of the medium at an exit where textures tell it, else 1."""
         if not out.medium:
             return mi.Spectrum(1)
         return sent_back(dr, out.medium.albedo, mi.Spectrum([opaque(m.g) for m in self.object.media]))
