@@ -440,9 +440,11 @@ class LightVisitor:
             return none, none
         smooth = ~self.media.row("rough", k)
         behind = self.emitter_behind(walk, si, k, smooth & active) if self.sees_through else none
-        return self.mirrored_emitter(walk, si, bsdf, smooth & active), behind
+        return self.mirrored_emitter(walk, si, bsdf, k, smooth & active), behind
 
-    def mirrored_emitter(self, walk: Walk, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool) -> Seen:
+    def mirrored_emitter(
+        self, walk: Walk, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32, active: mi.Bool
+    ) -> Seen:
         """What a smooth boundary mirrors, which no random choice of reflection then meets: F L_e, and 1 - F."""
         # the mirrored direction with its reflectance F, and L_e there
         ctx = mi.BSDFContext()
@@ -450,7 +452,8 @@ class LightVisitor:
         bs, value = bsdf.sample(ctx, si, 0.0, mi.Point2f(0), active)
         d, _ = sided(si, bs.wo)
         L_e, nothing = self._emission_along(si, d, active & (bs.pdf > 0))
-        return Seen(walk.weight * value * L_e, active, dr.select(nothing, 1 - value, 1))
+        F = mi.Spectrum(self.media.reflected(k, si)) if self.media.tinted else value
+        return Seen(walk.weight * value * L_e, active, dr.select(nothing, 1 - F, 1))
 
     def emitter_behind(self, walk: Walk, si: mi.SurfaceInteraction3f, k: mi.Int32, active: mi.Bool) -> Seen:
         """What is seen through object k without reflection inside, which no free flight then meets.
@@ -478,7 +481,8 @@ class LightVisitor:
         d, _ = sided(out, bs.wo)
         leaving = active & (bs.pdf > 0) & (dr.dot(d, out.n) > 0)
         L_e, nothing = self._emission_along(out, d, leaving)
-        passed = dr.select(leaving, T * leaves * dr.square(bs.eta), 0)
+        let_out = mi.Spectrum(1 - self.media.reflected(k, out)) if self.media.tinted else leaves * dr.square(bs.eta)
+        passed = dr.select(leaving, T * let_out, 0)
         light = dr.select(leaving, walk.weight * value * T * leaves * L_e, 0)
         return Seen(light, active, dr.select(nothing, 1 - passed, 1))
 

@@ -156,7 +156,7 @@ class SubpathConnections:
         enters &= (dr.dot(si.n, w) > 0) & (mi.Frame3f.cos_theta(si.wi) > 0) & (dr.dot(si.n, d) < 0)
         # shading normals bend the ray, geometric ones hold its width
         bend = dr.dot(d, si.n) * mi.Frame3f.cos_theta(si.wi) / (dr.dot(d, si.sh_frame.n) * dr.dot(w, si.n))
-        weight = dr.select(enters, flux * ((1 - F) * bend), 0)
+        weight = dr.select(enters, flux * ((1 - F) * bend) * self.media.tint(k, si, reflects=False), 0)
         enters &= dr.max(weight) > 0
 
         # ---- the walk from there, with the medium of the walk from the camera
@@ -254,7 +254,8 @@ class SubpathConnections:
         # ---- reflected with the probability F, else the subpath ends
         inside = (dr.dot(si.n, new) < 0) & (walk.rng.next_float32() < F)
         o, off = self.media.depart(si, new, mi.Bool(True))
-        walk = replace(walk, o=o, d=new, off=off, alive=walk.alive & (passes | inside))
+        weight = walk.weight * dr.select(passes, 1, self.media.tint(k, si, reflects=True))
+        walk = replace(walk, o=o, d=new, off=off, alive=walk.alive & (passes | inside), weight=weight)
         return walk, lit | ~passes, ray, hit
 
 
@@ -378,7 +379,7 @@ class EmitterDirections:
         phase = eval_phase(m, dr.dot(event.along, d))
         factor = (1 - F) * dr.square(eta_ti) / (pdf / n + channel_mean(phase))
         T = self.media.transmittance(k, ray, dr.select(valid, si.t, 0), rng, event.medium)
-        value = phase * T * factor
+        value = phase * T * factor * self.media.tint(k, si, reflects=False)
         light = dr.select(valid, value * self.small.along(which, way, outside, valid), 0)
         if not self.scored:
             return light, ()

@@ -572,6 +572,23 @@ class WalkMedia:
         return any(is_rough(b) for b in self.boundaries)
 
     @property
+    def tinted(self) -> bool:
+        """Whether a boundary has colours, which its choice between reflection and refraction leaves out."""
+        return any(key.startswith("specular_") for b in self.boundaries for key in mi.traverse(b).keys())
+
+    def reflected(self, k: mi.Int32, si: mi.SurfaceInteraction3f) -> mi.Float:
+        """F of the smooth boundary of object k at a point, without its colour."""
+        return mi.fresnel(mi.Frame3f.cos_theta(si.wi), self.row("eta", k))[0]
+
+    def tint(self, k: mi.Int32, si: mi.SurfaceInteraction3f, reflects: bool) -> mi.Spectrum:
+        """The colour that the smooth boundary of object k reflects, or refracts, at a point."""
+        if not self.tinted:
+            return mi.Spectrum(1)
+        # the weight of a choice that is given is its colour
+        ctx = mi.BSDFContext(mi.TransportMode.Importance)
+        return self.boundary(k).sample(ctx, si, 0.0 if reflects else 1.0, mi.Point2f(0))[1]
+
+    @property
     def needed(self) -> int:
         """What boundaries have to know of a point that a walk meets: derivatives of positions where one is rough."""
         few = mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame | mi.RayFlags.UV
