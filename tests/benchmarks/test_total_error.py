@@ -64,7 +64,7 @@ def test_precomputed_light_comes_nearer_to_the_reference_in_more_time(
     monkeypatch.setattr(module, "VOLUMES", module.VOLUMES[:1])
     monkeypatch.setattr(module, "PASSING", (*module.VOLUMES, module.SAMPLED, module.PRECOMPUTED))
     monkeypatch.setattr(module, "MOST_SPP", 16)
-    how, whole, kept = module.TotalErrors((0.25, 1.0), 2.0, 24), module._corrected, []
+    how, whole, kept = module.TotalErrors((0.25, 2.0), 4.0, 24), module._corrected, []
 
     def once(fresh: Any, limit: float, seed: int) -> Any:
         """16 samples for both times, which a slow machine would not reach."""
