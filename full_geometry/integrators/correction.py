@@ -90,7 +90,7 @@ class SurfaceCorrection:
     @property
     def walks(self) -> int:
         """How many walks it is of, without those whose place is not on the object or has no point near it."""
-        return int(sum(half[0].number.sum() for half in self.halves))
+        return int(_number(self.halves))
 
     @classmethod
     def of(
@@ -100,7 +100,7 @@ class SurfaceCorrection:
         points = gathered.points
         p, n = (np.array(v, dtype=float).T for v in (points.p, points.n))
         B = np.array(gathered.values, dtype=float).reshape(len(points), -1, gathered.terms)
-        found = levels(p, n, area, float(sum(half[0].number.sum() for half in halves)))
+        found = levels(p, n, area, _number(halves))
         C, squared, whole = [], 0.0, 0.0
         for parts, known in zip(zip(*halves), np.array_split(B[:, :, 0], len(halves[0]), axis=1)):
             G = known.mean(axis=1)
@@ -292,6 +292,11 @@ def _check(obj: TranslucentObject, settings: Settings, alone: bool) -> None:
         raise ValueError(f"light of object {obj.geometry.name} must be sampled, got corrected: {reason}")
 
 
+def _number(halves: tuple[list[ResidualSums], list[ResidualSums]]) -> float:
+    """Residuals of the channels that have most."""
+    return float(sum(max(part.number.sum() for part in half) for half in halves))
+
+
 def _nothing(gathered: Gathered) -> list[list[ResidualSums]]:
     terms = TERMS if gathered.object.textured is None else TERMS + len(painted(0))
     parts = [ResidualSums.zeros(len(gathered.points), len(part), terms) for part in _channels_together(gathered)]
@@ -299,9 +304,10 @@ def _nothing(gathered: Gathered) -> list[list[ResidualSums]]:
 
 
 def _channels_together(gathered: Gathered) -> list[np.ndarray]:
-    """Channels that are fitted together, as their factors are alike: all, but each alone where textures part them."""
-    channels = np.arange(dr.size_v(mi.Spectrum))
-    return [channels] if gathered.object.textured is None else list(channels[:, None])
+    """Channels that are fitted together, as their factors are alike: all, but each alone where textures part them, or
+    one sends no light back."""
+    channels, alike = np.arange(dr.size_v(mi.Spectrum)), gathered.object.textured is None
+    return [channels] if alike and (gathered.albedo.whole > LEAST_ALBEDO).all() else list(channels[:, None])
 
 
 def residuals(tracer: PathTracer, k: int, gathered: Gathered, seed: int) -> list[ResidualSums]:
@@ -346,19 +352,19 @@ def residuals(tracer: PathTracer, k: int, gathered: Gathered, seed: int) -> list
             f"light of walks at object {gathered.object.geometry.name} must be finite, got NaN or infinity"
         )
 
-    # ---- sums over the residuals of each point
-    kept = np.array(near) & (np.array(a).min(axis=0) > LEAST_ALBEDO)
+    # ---- sums over the residuals of each point, of channels that send any light back there
+    kept = np.array(near)
     a, r, W, R, bent_w = (np.array(v, dtype=float)[:, kept].T for v in (a, r, W, R, bent_w))
     a = a / scale_of(gathered)
     r = _steadied(r, a)
     Y = np.stack(directional(*bent_w.T, np.array(mu, dtype=float)[kept]), axis=1)
-    point, number = np.array(point)[kept], len(gathered.points)
-    if gathered.object.textured is None:
-        return [ResidualSums.of(point, Y, a, r, W, number)]
-    return [
-        ResidualSums.of(point, np.column_stack([Y, *painted(R[:, c])]), a[:, c], r[:, c], W[:, c], number)
-        for c in _channels_together(gathered)
-    ]
+    point, found = np.array(point)[kept], []
+    for c in _channels_together(gathered):
+        some = a[:, c].min(axis=1) > LEAST_ALBEDO
+        terms = Y if gathered.object.textured is None else np.column_stack([Y, *painted(R[:, c])])
+        values = (v[some] for v in (terms, a[:, c], r[:, c], W[:, c]))
+        found.append(ResidualSums.of(point[some], *values, len(gathered.points)))
+    return found
 
 
 def _bare(media: WalkMedia, beyond: mi.SurfaceInteraction3f, w: mi.Vector3f) -> mi.Bool:
@@ -375,7 +381,7 @@ def _steadied(r: np.ndarray, a: np.ndarray) -> np.ndarray:
     """
     # the sum stays: Σ a_s times the mean of what is lost
     kept = cut_to_next(r, BRIGHTEST)
-    return kept + a * ((r - kept).sum(axis=0) / a.sum(axis=0))
+    return kept + a * ((r - kept).sum(axis=0) / np.maximum(a.sum(axis=0), 1e-30))
 
 
 def scale_of(gathered: Gathered) -> np.ndarray:

@@ -80,10 +80,10 @@ class ResidualSums:
         """Sums of residuals r (n, channels) of light (n, channels) in directions of Y (n, terms) at points.
         Their factors a (n, channels) are above 0."""
         # a is the mean over the channels, so that all have the same weights
-        weight = a.mean(axis=1)
-        outer = (weight[:, None, None] * Y[:, :, None] * Y[:, None, :]).reshape(len(Y), -1)
-        right = ((weight[:, None] * r / a)[:, None, :] * Y[:, :, None]).reshape(len(Y), -1)
-        at, terms = csr_array((np.ones(len(Y)), (point, np.arange(len(Y)))), shape=(points, len(Y))), Y.shape[1]
+        weight, (n, terms) = a.mean(axis=1), Y.shape
+        outer = (weight[:, None, None] * Y[:, :, None] * Y[:, None, :]).reshape(n, terms * terms)
+        right = ((weight[:, None] * r / a)[:, None, :] * Y[:, :, None]).reshape(n, terms * r.shape[1])
+        at = csr_array((np.ones(n), (point, np.arange(n))), shape=(points, n))
         number = np.bincount(point, minlength=points).astype(float)
         return cls(number, (at @ outer).reshape(points, terms, terms), (at @ right).reshape(points, terms, -1),
                    light.sum(axis=0))  # fmt: skip

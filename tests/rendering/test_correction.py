@@ -220,6 +220,12 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(correction, name, getattr(correction, name) // 8)
 
 
+def test_a_medium_that_is_black_in_two_channels_has_the_light_of_walks_in_the_other(few: None) -> None:
+    red = {"sigma_t": 1.2, "albedo": "0.9,0,0", "eta": 1.4}
+    walked, found = (_image(_scene(light, red, _lamp()), 256).mean(axis=(0, 1)) for light in ("walk", "corrected"))
+    np.testing.assert_allclose(found, walked, rtol=0.05)
+
+
 def test_walks_are_added_for_an_image_of_more_samples_and_kept_for_one_of_fewer(scene: Any, few: None) -> None:
     walks = []
     for spp in (16, 2**11, 16):
