@@ -40,7 +40,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from full_geometry.geometry.sensors import seeded
+from full_geometry.geometry.sensors import sampled_size, seeded
 from full_geometry.geometry.snapshot import children, scene_hash, words
 from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.objects.objects import translucent_shapes
@@ -304,6 +304,9 @@ class Limits:
 def _pass(start: Reference, scene: mi.Scene, integrator: mi.Integrator, spp: int) -> Reference:
     about, number = start.about, start.passes
     started, sensor, seed = time.perf_counter(), about["sensor"], seeded(about["seed"], number)
+    if is_bssrdf(integrator):  # corrected light has its walks by all samples so far, twice as many now and then
+        samples = (start.spp + spp) * int(np.prod(sampled_size(scene.sensors()[sensor].film())))
+        integrator.prepare(scene, 2 ** (samples.bit_length() - 1))
     image = mi.render(scene, sensor=sensor, integrator=integrator, seed=seed, spp=spp)
     image = finite_pixels(f"pass {number}", image)
     if not number:

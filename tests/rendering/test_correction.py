@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from full_geometry.geometry.light_points import lattice
 from full_geometry.integrators import correction
 from full_geometry.integrators.correction import PER_LAUNCH, ROOTS, Corrections
 from full_geometry.precomputed.surface_regression import TERMS, ResidualSums, directional, levels, smooth_field
+from full_geometry.scenes import reference
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -234,6 +236,12 @@ def test_walks_are_added_for_an_image_of_more_samples_and_kept_for_one_of_fewer(
         walks.append(int(told.split("corrected by ")[1].split()[0]))
     assert walks[0] == correction.FEWEST
     assert walks[1] == walks[2] == pytest.approx(144 * 2**11 / 8, rel=0.3)
+
+
+def test_a_render_in_passes_has_walks_by_all_its_samples(scene: Any, few: None, tmp_path: Path) -> None:
+    reference.render(scene, tmp_path / "image.exr", spp=2048)
+    (told,) = scene.integrator().corrections.told()
+    assert int(told.split("corrected by ")[1].split()[0]) > 1.5 * correction.FEWEST
 
 
 def test_walks_that_are_added_have_seeds_of_their_own_however_many_were_lost(
