@@ -165,10 +165,9 @@ class LightVisitor:
     def _split_event(self, walk: Walk, record: LightRecord, event: Event) -> tuple[Walk, LightRecord]:
         """The walk and its record where phase functions are split: what has turned forwards alone is no deep light."""
         # ---- L += f throughput J, f the forward share of the turns so far, in deep light the rest
-        before, L, first = record.run.share, record.L, walk.order == 0
+        before, L, first, shallow = record.run.share, record.L, walk.order == 0, record.shallow
         walk, record, _ = self._lit_event(walk, record, event)
-        share, shallow = record.run.share, record.shallow
-        f = dr.select(shallow, 1 - share if self.deep else share, 1)
+        f = dr.select(shallow, self._part(walk, record), 1)
         if self.ahead and not self.deep:  # looked up along the flight
             f = dr.select(shallow & first, 0, f)
         record = replace(record, L=L + f * (record.L - L))
@@ -177,10 +176,15 @@ class LightVisitor:
 
         # ---- walks end where all is deep from here on, as where g is 0, else by roulette as the share falls
         onward = dr.max(dr.abs(mi.Spectrum(event.m.g))) > 0
-        kept = dr.minimum(dr.max(dr.abs(share)) / dr.maximum(dr.max(dr.abs(before)), 1e-6), 1)
+        kept = dr.minimum(dr.max(dr.abs(record.run.share)) / dr.maximum(dr.max(dr.abs(before)), 1e-6), 1)
         kept = dr.select(shallow, dr.select(onward, dr.select(first, 1, kept), 0), 1)
         alive = walk.alive & (walk.rng.next_float32() < kept)
         return replace(walk, alive=alive, weight=walk.weight / dr.maximum(kept, 1e-6)), record
+
+    def _part(self, walk: Walk, record: LightRecord) -> mi.Spectrum:
+        """f of a walk: the forward share of its turns, 1 before the first, and in deep light the rest."""
+        share = dr.select(walk.order > 0, record.run.share, 1)
+        return 1 - share if self.deep else share
 
     @property
     def ahead(self) -> bool:
@@ -214,9 +218,8 @@ class LightVisitor:
         """The walk and its record; where it has moved on before deep light began, L stays in that."""
         early = record.shallow & moved
         record = replace(record, shallow=record.shallow & ~early)
-        if self.forward:  # throughput *= f, 1 before the first turn, and what this step has brought by f
-            share = dr.select(walk.order > 0, record.run.share, 1)
-            f = dr.select(early, 1 - share if self.deep else share, 1)
+        if self.forward:  # throughput *= f, and what this step has brought by f
+            f = dr.select(early, self._part(walk, record), 1)
             walk = replace(walk, weight=walk.weight * f, alive=walk.alive & (dr.max(dr.abs(f)) > 0))
             return walk, replace(record, L=L + f * (record.L - L))
         if not self.deep:
@@ -308,8 +311,7 @@ class LightVisitor:
             record = replace(record, run=record.run.onward(walk.d))
         left = self.left(record)
         if self.forward and self.splits:  # as deep light is split
-            share = dr.select(walk.order > 0, record.run.share, 1)
-            left = left * dr.select(record.shallow, 1 - share if self.deep else share, 1)
+            left = left * dr.select(record.shallow, self._part(walk, record), 1)
         else:
             active = active & ~record.shallow if self.deep else active
         light = self.sampled_emitter(walk, si, self.media.boundary(walk.object), active & (dr.max(dr.abs(left)) > 0))

@@ -304,7 +304,8 @@ class Limits:
 def _pass(start: Reference, scene: mi.Scene, integrator: mi.Integrator, spp: int) -> Reference:
     about, number = start.about, start.passes
     started, sensor, seed = time.perf_counter(), about["sensor"], seeded(about["seed"], number)
-    if is_bssrdf(integrator):  # corrected light has its walks by all samples so far, twice as many now and then
+    # corrected light, as asked for or as chosen, has its walks by all samples so far, twice as many now and then
+    if is_bssrdf(integrator) and (integrator.settings.light == "corrected" or integrator.corrections.told()):
         samples = (start.spp + spp) * int(np.prod(sampled_size(scene.sensors()[sensor].film())))
         integrator.prepare(scene, 2 ** (samples.bit_length() - 1))
     image = mi.render(scene, sensor=sensor, integrator=integrator, seed=seed, spp=spp)
