@@ -156,7 +156,7 @@ class Corrections:
         """The objects of a scene, each at one place, where no model has light of them; None where models have it.
 
         Raises:
-            ValueError: they are at too many places, or one is open.
+            ValueError: they are at too many places, one is open, or all are in glass.
         """
         if mi.is_spectral:  # refused with models
             return None
@@ -174,7 +174,13 @@ class Corrections:
             for obj in media.objects:
                 if not obj.closed:
                     raise ValueError(f"light must be sampled for object {obj.name}, which is not closed, got corrected")
-            self._alone = media, state, [_without_light(media, k, scene) for k in range(places)]
+            objects = [_without_light(media, k, scene) for k in range(places)]
+            if objects and all(obj.gathered is None for obj in objects):
+                raise ValueError(
+                    f"light must be sampled for object {objects[0].geometry.name}, of which nothing is outside of "
+                    "glass and other objects, got corrected: translucent_walk takes it"
+                )
+            self._alone = media, state, objects
         return self._alone[2]
 
     def of(

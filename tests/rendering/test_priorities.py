@@ -236,6 +236,13 @@ def test_models_refuse_what_overlaps() -> None:
         scene.integrator().render(scene, spp=1)
 
 
+def test_corrected_light_refuses_objects_that_are_all_in_glass() -> None:
+    things = {"glass": _ball(1.0, bsdf=GLASS), "wax": _ball(0.5, bsdf=CREAM)}
+    scene = _view(things, integrator={"type": "bssrdf", "light": "corrected"})
+    with pytest.raises(ValueError, match="must be sampled for object 'wax', of which nothing is outside of glass"):
+        scene.integrator().render(scene, spp=1)
+
+
 def test_a_priority_is_a_finite_number() -> None:
     with pytest.raises(RuntimeError, match="priority must be finite, got inf"):
         mi.load_dict({**JELLY, "priority": float("inf")})
