@@ -29,6 +29,7 @@ from full_geometry.integrators.correction import Corrections
 from full_geometry.integrators.gathering import Gathering
 from full_geometry.integrators.lit_entries import LitEntries
 from full_geometry.integrators.surface_paths import replay_paths, trace_paths
+from full_geometry.objects.inclusions import check_sensors
 from full_geometry.objects.objects import KnowsUnit, TranslucentObject
 from full_geometry.objects.small_emitters import check_emitters
 from full_geometry.settings import GATHERED_LIGHTS, Choices, Settings, read_settings
@@ -138,6 +139,7 @@ def _class(variant: str) -> type:
                 return
 
             # ---- proposals for entries of the objects by the light
+            check_sensors(scene, [obj.geometry for obj in objects], [sensor])
             for obj in objects:
                 if obj.spectral is not None:
                     obj.spectral.check_covers(obj.geometry.name, sensor)

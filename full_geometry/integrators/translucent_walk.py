@@ -300,12 +300,14 @@ def _class(variant: str) -> type:
 
 
 def _prepared(scene: mi.Scene, before: tuple, mm_per_unit: float) -> tuple[SceneMark, list, list, Any]:
-    """Mark, shapes, places and media of a scene: those of before, unless shapes, inner lights or media changed."""
+    """Mark, shapes, places and media of a scene: those of before, unless shapes, inner lights or media changed.
+    ValueError, whatever changed, if a camera is inside an object."""
     # ---- what was made before still holds
     shapes = scene.shapes()  # the scene itself, which holds its integrator, would never be freed
     mark, places = SceneMark(scene), places_of(scene)
     same = before[0] == mark and same_objects(before[1], shapes) and before[2] == places
     if before[3] is not None and same and before[3].is_current(scene):
+        check_sensors(scene, before[3].objects)
         return before
 
     # ---- media anew, and warnings of cameras inside objects and of doubtful units
@@ -360,6 +362,7 @@ def _render(
     glints: Glints | None = None,
 ) -> None:  # fmt: skip
     """Fill the film of a sensor, in launches between which an interrupt is heard."""
+    check_sensors(tracer.visitor.scene, tracer.visitor.media.outermost, [sensor])
     for obj, inside in zip(tracer.visitor.media.objects, tracer.visitor.media.specs):
         if inside.spectral is not None:
             inside.spectral.check_covers(obj.name, sensor)

@@ -268,20 +268,24 @@ def place_of(emitter: mi.Emitter) -> np.ndarray | None:
     return np.ravel(np.array(ds.p, dtype=float))
 
 
-def check_sensors(scene: mi.Scene, objects: list[Geometry]) -> None:
+def check_sensors(scene: mi.Scene, objects: list[Geometry], sensors: list[mi.Sensor] | None = None) -> None:
     """Refuse sensors inside of objects, of any kind: they may have several places, or a surface.
-    ValueError if rays of a sensor begin inside an object, whose id is named."""
+    `sensors`: those of the scene where None. ValueError if rays of a sensor begin inside an object, whose id is
+    named."""
     holders = InstanceTable([obj.shape for obj in objects], shown_groups(scene))
-    for sensor in scene.sensors():
+    for sensor in scene.sensors() if sensors is None else sensors:
+        o, d = _rays(sensor) if objects else (None, None)
         for b, each in enumerate(objects):
-            if is_inside(each, _into(holders.to_world(b), _starts(sensor, each.size))).any():
+            # off a surface that the rays leave by a little of the size of an object
+            if is_inside(each, _into(holders.to_world(b), o + 1e-4 * each.size * d)).any():
                 raise ValueError(f"the camera must be outside of every object, got it inside {each.name}")
 
 
-def _starts(sensor: mi.Sensor, size: float) -> np.ndarray:
-    """Shape (3, n); off a surface that the rays leave by a little of the size of an object."""
+def _rays(sensor: mi.Sensor) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and directions of some rays of a sensor, of shape (3, n)."""
     u = np.random.default_rng(13).random((5, STARTS)).astype(np.float32)
     numbers = [mi.Float(row.tolist()) for row in u]
     # not sample_ray, which some sensors lack
     ray, _ = sensor.sample_ray_differential(0.0, numbers[0], mi.Point2f(*numbers[1:3]), mi.Point2f(*numbers[3:]))
-    return np.array(mi.Point3f(ray.o + ray.d * dr.opaque(mi.Float, 1e-4 * size))).reshape(3, -1)
+    o, d = (np.array(v, dtype=float).reshape(3, -1) for v in (ray.o, ray.d))
+    return o, d

@@ -186,7 +186,9 @@ class TranslucentObjects:
             results = [obj.geometry for obj in objects]
             current = not any(geometry.inclusions for geometry in results) and not find_inclusions(scene, results)
             current = current and not objects[0].instance_scene.shapes
-        if not current:
+        if current:
+            check_sensors(scene, [obj.geometry for obj in objects])
+        else:
             if not (objects and same):
                 self.choices = choices_of(scene, self.settings, self.choose)
             settings = replace(self.settings, light=self.choices.light)

@@ -513,6 +513,11 @@ class WalkMedia:
         return (k < 0) if self.inner is None else dr.gather(mi.Bool, self.inner.tables["enclosed"], k)
 
     @property
+    def outermost(self) -> list[Geometry]:
+        """The objects, and the glass about them."""
+        return [*self.objects, *(self.inner.outer if self.inner is not None else ())]
+
+    @property
     def holders(self) -> InstanceTable:
         """Numbers of the objects, then of the glass that overlaps them."""
         return self.inner.priorities.instance_table if self.overlaps else self.instance_table

@@ -70,6 +70,18 @@ def test_a_sensor_inside_an_object_is_refused(integrator, sensor):
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_a_sensor_that_moves_into_an_object_or_stands_there_beside_the_scene_is_refused(integrator):
+    scene, within = make(integrator, camera(30.0, FILM)), camera(1.0, FILM)
+    image(scene, 1)
+    with pytest.raises(ValueError, match="the camera must be outside of every object, got it inside 'ball'"):
+        mi.render(scene, spp=1, sensor=mi.load_dict(within))
+    parameters = mi.traverse(scene)
+    parameters["sensor.to_world"] = mi.Transform4f(within["to_world"].matrix)
+    parameters.update()
+    assert refusal(scene) == "the camera must be outside of every object, got it inside 'ball'"
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_a_radiance_meter_sees_what_a_narrow_camera_sees(integrator):
     meter = image(make(integrator, camera(30.0, POINT, "radiancemeter")), 2**15)
     narrow = image(make(integrator, camera(30.0, POINT, fov=0.01)), 2**15)
