@@ -66,6 +66,7 @@ def _target(site: Path, page: Path, link: str) -> Path:
     return found / "index.html" if found.is_dir() else found
 
 
+@pytest.mark.slow
 def test_every_page_has_its_pictures_and_links_and_known_tags_only(site: Path) -> None:
     wrong, pictures = [], 0
     for file in sorted(site.rglob("*.html")):
@@ -138,6 +139,7 @@ def _resize(driver: Any, width: int) -> None:
     driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
 
 
+@pytest.mark.slow
 def test_pages_load_at_once_and_fit_a_phone_and_a_screen(site: Path) -> None:
     wait = pytest.importorskip("selenium.webdriver.support.wait").WebDriverWait
     pages = sorted(site.rglob("*.html"))

@@ -157,6 +157,7 @@ def test_at_equal_time_every_variant_trains_until_the_time_is_spent(table: panda
     assert (found["seconds"] >= 0.05).all() and (found["samples"] == found["steps"] * BATCH).all()
 
 
+@pytest.mark.slow
 def test_at_equal_data_a_seed_repeats_in_an_executor_and_another_one_differs(repeated: pandas.DataFrame) -> None:
     with ThreadPoolExecutor(1) as executor:
         again = _first_and_small(1, executor).drop(columns="seconds")

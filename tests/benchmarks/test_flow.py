@@ -151,6 +151,7 @@ REGIONS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("region", REGIONS)
 def test_entries_weighted_by_their_density_cover_the_area(sampler: FlowSampler, region: str) -> None:
     obj, n = sampler.chart.object, 2**18
@@ -185,6 +186,7 @@ class Numbers:
         return mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
 
 
+@pytest.mark.slow
 def test_proposals_of_the_flow_and_of_patches_give_the_same_estimate(sampler: FlowSampler) -> None:
     obj, n = sampler.chart.object, 2**18
     at = obj.points.sample(floats(uniform(n, 1, 20))[0], mi.Point2f(uniform(n, 2, 21)), True)

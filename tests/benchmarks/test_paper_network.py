@@ -39,6 +39,7 @@ def test_the_papers_network_takes_5_and_8_for_each_sample() -> None:
     assert linear[0].in_features == 5 + 8 * 7 and [m.out_features for m in linear] == [256, 256, 256, 3]
 
 
+@pytest.mark.slow
 def test_the_papers_network_learns_from_walks(obj: TranslucentObject) -> None:
     truth = reference(obj, 64, 512)
     recipe = paper.PaperRecipe(n=8, steps=100, batch=128, exits=512, reuse=8)

@@ -83,6 +83,7 @@ def test_alpha_is_the_light_that_comes_back_from_everywhere(obj: TranslucentObje
     assert values.std() / np.sqrt(n) < 0.05 * alpha
 
 
+@pytest.mark.slow
 def test_a_little_training_brings_alpha_to_the_truth(obj: TranslucentObject) -> None:
     model = fit_alpha_p(obj, FlowRecipe(steps=320, chunk=2**13, batch=512, rate=8e-3))
     truth = reference(obj, 64, 512)

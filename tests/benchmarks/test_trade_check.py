@@ -31,6 +31,7 @@ def test_a_random_scene_is_closed_and_faces_outwards(number: int, tmp_path: Path
     assert found.closed and found.upright and found.size == pytest.approx(100, rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_scene_that_was_measured_is_not_measured_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trade_check, "WAYS", ("path_traced", "lambert"))
     first = trade_check.check_scene(random_scene(1, 1), tmp_path, 0.2, 0.3)

@@ -37,6 +37,7 @@ def finished(tmp_path_factory: Any) -> tuple[Any, Path]:
     return _invoke(*QUICK, "--seed", "5", "--out", str(folder)), folder
 
 
+@pytest.mark.slow
 def test_curves_end_well_and_write_every_file(finished: tuple[Any, Path]) -> None:
     result, folder = finished
     assert result.exit_code == 0
@@ -78,6 +79,7 @@ def test_given_coefficients_replace_those_of_fig_10(tmp_path: Path) -> None:
     assert (parameters["r_edges_mm"][0], parameters["r_edges_mm"][-1]) == pytest.approx((0.1, 3))
 
 
+@pytest.mark.slow
 def test_a_material_is_compared_by_name_and_channel(tmp_path: Path) -> None:
     assert _invoke(*QUICK, "ketchup", "--channel", "B", "--out", str(tmp_path)).exit_code == 0
     assert json.loads((tmp_path / "curves.json").read_text())["parameters"]["title"] == "ketchup B"

@@ -131,6 +131,7 @@ for _ in range(2):
     assert messages == "interrupted; waits for a kernel that cannot be, the next one ends it\n"
 
 
+@pytest.mark.slow
 def test_long_walks_of_a_slow_medium_end_within_two_seconds(tmp_path: Path) -> None:
     body = """
 import halfspace_sss as sss
@@ -147,6 +148,7 @@ sss.trace(medium, n_paths=10**8)"""
     assert messages == LINE
 
 
+@pytest.mark.slow
 def test_maps_of_a_slow_medium_end_within_two_seconds_and_keep_what_is_finished(tmp_path: Path) -> None:
     body = """
 import halfspace_sss as sss

@@ -123,6 +123,7 @@ def _belong_together(folder: Path, stem: str) -> bool:
     return json.loads(mi.Bitmap(str(folder / f"{stem}.exr")).metadata()["halfspace_sss"]) == header
 
 
+@pytest.mark.slow
 def test_an_interrupt_keeps_the_files_of_before_and_what_is_done_under_another_name(
     scene: Path, monkeypatch: Any
 ) -> None:
@@ -270,6 +271,7 @@ def test_light_met_by_chance_is_told_in_a_sentence_where_it_is_a_share_of_noise_
     assert (sentence in found) == told and "variance" not in found.replace(sentence, "")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
 @pytest.mark.parametrize(
     ("model", "after"),

@@ -61,6 +61,7 @@ def _weights(folder: str = "weights") -> list[Path]:
     return sorted(Path(folder).glob("*.safetensors"))
 
 
+@pytest.mark.slow
 def test_training_without_a_name_writes_weights_of_fig10_where_its_model_finds_them() -> None:
     """With the upper end of the error, and with its work in a folder of the material and channel."""
     result = _invoke("train", "material", "--fast", "--work", "unfinished")
@@ -110,6 +111,7 @@ def test_the_name_of_a_material_cannot_lead_out_of_the_work_folder(
     assert not (Path("a") / "x").exists() and not Path("x").exists()
 
 
+@pytest.mark.slow
 def test_the_universal_network_is_trained_into_a_folder() -> None:
     result = _invoke("train", "universal", "--steps", "3", "--out", "all")
     assert result.exit_code == 0 and "neural.safetensors" in result.stdout
@@ -170,6 +172,7 @@ def test_bad_input_is_refused_before_any_work(
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
+@pytest.mark.slow
 def test_errors_are_written_for_every_model_that_takes_the_medium() -> None:
     result = _errors("--events", "2e4", "--out", "deep/found")
     assert result.exit_code == 0, result.output
@@ -207,6 +210,7 @@ def test_errors_are_repeated_by_their_seed() -> None:
     assert Path("a/errors.csv").read_bytes() == Path("b/errors.csv").read_bytes()
 
 
+@pytest.mark.slow
 def test_given_coefficients_are_trained_and_among_the_errors() -> None:
     medium = ("--albedo", "0.6", "--g", "0.2", "--eta", "1.1", "--sigma-t", "3")
     assert _invoke("train", "material", *medium).exit_code == 0
@@ -215,6 +219,7 @@ def test_given_coefficients_are_trained_and_among_the_errors() -> None:
     assert result.exit_code == 0 and "neural_material" in result.stdout
 
 
+@pytest.mark.slow
 def test_held_out_media_are_summed_up_by_percentiles_ranges_and_losses() -> None:
     chosen = ("--model", "neural", "--model", "standard_dipole")
     result = _errors("--held-out", "4", "--events", "2e4", *chosen)

@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 COMMANDS = {
     "--help": [],
     "curves": ["--paths", "0", "--theta-i", "0", "--model", "neural", "--out", "curves"],
@@ -37,6 +39,7 @@ print(json.dumps(found))
 HEAVY = ("drjit", "matplotlib", "mitsuba", "numpy", "pandas", "torch", "xarray")
 
 
+@pytest.mark.slow
 def test_commands_of_the_plane_run_without_mitsuba(tmp_path: Path) -> None:
     env = {**os.environ, "HALFSPACE_SSS_WEIGHTS": str(tmp_path / "weights")}
     command = [sys.executable, "-c", RUN, json.dumps(COMMANDS)]

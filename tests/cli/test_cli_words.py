@@ -67,6 +67,7 @@ def test_walks_may_be_written_with_an_exponent(tmp_path: Path) -> None:
     assert result.exit_code == 0 and "4,096 walks" in result.stdout
 
 
+@pytest.mark.slow
 def test_quiet_prints_nothing_and_writes_all(tmp_path: Path) -> None:
     options = ["--paths", "4096", "--theta-i", "0", "--model", "better_dipole", "--out", str(tmp_path)]
     result = _invoke("curves", "--quiet", *options)

@@ -200,6 +200,7 @@ USES = (
 )
 
 
+@pytest.mark.slow
 def test_without_a_variant_of_mitsuba_a_scene_is_refused_with_what_to_do() -> None:
     pytest.importorskip("mitsuba")
     code = "\n".join(f"try:\n    {use}\nexcept ValueError as error:\n    print(error)" for use in USES)

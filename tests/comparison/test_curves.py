@@ -47,6 +47,7 @@ def test_the_default_range_scales_with_the_medium() -> None:
     assert (near, far) == pytest.approx((0.005, 2.5), rel=0.05)
 
 
+@pytest.mark.slow
 def test_all_models_and_the_traced_curve_are_there(fig10: CurveSet) -> None:
     assert fig10.series == (TRACED, *halfspace_sss.models())
     assert fig10.theta_i_deg == (0.0, 60.0)

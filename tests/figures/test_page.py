@@ -250,5 +250,6 @@ def test_bad_input_is_refused(make: Any, message: str) -> None:
         make()
 
 
+@pytest.mark.slow
 def test_the_same_images_give_the_same_page(text: str) -> None:
     assert page("Models </script> & all", _scenes(), caption="a caption", notes="what FLIP is") == text

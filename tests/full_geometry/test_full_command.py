@@ -181,6 +181,7 @@ def test_an_interrupted_training_goes_on_to_the_same_weights(monkeypatch: Any) -
     assert _invoke(*again).exit_code == 0 and _same("whole", "parts")
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_up_leaves_no_half_weights_and_work_to_go_on_from(monkeypatch: Any) -> None:
     arguments = ("train", "object", "--scene", "ball.xml", "--work", "work")
     sync = os.fsync

@@ -135,6 +135,7 @@ class Nothing:
 LIGHTING = {"sky": SKY, "lamp": {"light": ball(2.0, (3, 1.5, 1.5), emitter={"type": "area", "radiance": 1.0})}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("light", LIGHTING)
 def test_orders_below_two_of_images_are_those_of_walks_that_meet_nothing_inside(
     light: str, monkeypatch: pytest.MonkeyPatch

@@ -74,6 +74,7 @@ def check_sums(every: Pairs, kept: Pairs, p: np.ndarray) -> None:
         assert np.all(np.abs(found - expected) < 4 * spread + 1e-4 * np.abs(expected) + 1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("medium", MEDIA)
 def test_walks_that_are_kept_by_chance_carry_the_light_of_all(shape: str, medium: str) -> None:
@@ -95,6 +96,7 @@ def test_of_walks_that_are_kept_dark_channels_have_half_the_noise() -> None:
     assert np.all(noise(kept) < noise(every) * [1, 0.75, 0.75])
 
 
+@pytest.mark.slow
 def test_proposals_that_are_used_have_the_sums_of_all_and_less_noise() -> None:
     source = source_of("bunny", "dark")
     walks, proposals = source.walks(N // 8, (5,)), source.proposed(N, (5,))

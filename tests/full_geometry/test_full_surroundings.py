@@ -86,6 +86,7 @@ def test_fields_have_mean_zero_and_no_direction_of_larger_spread_over_points_and
         assert spread[-1] < 1.1 and np.all(spread[2:] > 0.7)  # what hardly varies stays small
 
 
+@pytest.mark.slow
 def test_what_surrounds_a_point_is_the_same_where_the_object_has_been_moved() -> None:
     obj = wax_bunny()
     turn = mi.ScalarTransform4f().translate([5, -2, 3]).rotate([0.6, 0, 0.8], 70)

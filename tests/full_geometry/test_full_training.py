@@ -89,6 +89,7 @@ def constant(found: list) -> np.ndarray:
     return np.array([row.error for row in found if row.light == LIGHTS[0]])
 
 
+@pytest.mark.slow
 def test_training_halves_the_error_of_the_half_space(trained: Trained) -> None:
     obj = trained.model.object
     proposals = EntryProposals(obj, HalfSpace(obj, "better_dipole"))
@@ -185,6 +186,7 @@ def test_work_of_another_object_is_refused(trained: Trained) -> None:
         train(ball(2.5), WAX, chunks=CHUNKS, recipe=QUICK, folder=folder / "weights", work=folder / "work")
 
 
+@pytest.mark.slow
 def test_a_run_stops_where_its_error_is_small_enough(few_exits: None, tmp_path: Path) -> None:
     found = train(ball(), WAX, chunks=8, recipe=QUICK, target_error=0.9, folder=tmp_path)
     assert found.steps < 0.5 * 8 * QUICK.reuse * QUICK.chunk / QUICK.batch
@@ -325,6 +327,7 @@ def test_one_exit_gathers_many_entries_in_one_loop(trained: Trained) -> None:
     assert np.allclose(np.array(gathered), alone, rtol=1e-4, atol=1e-7 * alone.max())
 
 
+@pytest.mark.slow
 def test_a_plan_by_time_is_kept_by_the_run_that_goes_on(few_exits: None, tmp_path: Path) -> None:
     found = train(ball(), WAX, seconds=1.0, recipe=QUICK, folder=tmp_path, work=tmp_path / "work")
     planned = json.loads((tmp_path / "work" / training.PLAN).read_text())["chunks"]
@@ -332,6 +335,7 @@ def test_a_plan_by_time_is_kept_by_the_run_that_goes_on(few_exits: None, tmp_pat
     assert record["chunks"] == planned >= 2
 
 
+@pytest.mark.slow
 def test_a_mono_variant_learns_one_channel(few_exits: None, tmp_path: Path) -> None:
     mi.set_variant("llvm_ad_mono")
     found = train(ball(), WAX.channel(1), chunks=2, recipe=QUICK, folder=tmp_path)

@@ -44,6 +44,7 @@ def halved(obj: TranslucentObject) -> NeuralShape:
     return NeuralShape(model.object, model.half_space, model.weights, model.media, [0.5] * len(model.media))
 
 
+@pytest.mark.slow
 def test_as_much_light_leaves_a_small_sphere_as_by_walks() -> None:
     # the noise of the ratio is below 1 %; the tolerance is three times that
     found = errors_of(ball(1.0), {"held": transport(ball(1.0))}, exits=64, walks=4096, samples=2048)

@@ -90,6 +90,7 @@ def moved(at: SurfacePoint, turn: mi.ScalarTransform4f, scale: float) -> Surface
     return SurfacePoint(p * scale, n, n_out, w)
 
 
+@pytest.mark.slow
 def test_on_a_plane_it_is_the_half_space_whatever_the_weights() -> None:
     box = mi.load_dict({"type": "cube", "to_world": mi.ScalarTransform4f().scale(2000.0)})
     obj = object_of(box, WAX)
@@ -147,6 +148,7 @@ def test_scale_turn_and_order_of_triangles_do_not_count() -> None:
     assert np.quantile(np.abs(ratio - 1), 0.97) < 0.01  # a ray that meets an edge may go to either side
 
 
+@pytest.mark.slow
 def test_resolution_does_not_count() -> None:
     def ball(p: np.ndarray) -> np.ndarray:
         return np.linalg.norm(p, axis=-1) - 1
@@ -162,6 +164,7 @@ def test_resolution_does_not_count() -> None:
     assert (np.abs(found[0][:, 0] - found[1][:, 0]) / scatter).max() < 0.15
 
 
+@pytest.mark.slow
 def test_a_channel_is_what_its_medium_is_alone() -> None:
     mi.set_variant("llvm_ad_rgb")
     shape = make_shape("combs", 6, 24).mitsuba("comb")
@@ -176,6 +179,7 @@ def test_a_channel_is_what_its_medium_is_alone() -> None:
         assert np.quantile(np.abs(together[k] - alone[k]) / (alone[k] + floor), 0.99) < 0.02
 
 
+@pytest.mark.slow
 def test_torch_and_drjit_say_the_same() -> None:
     torch = pytest.importorskip("torch")
     from full_geometry.learning.shape_training import ShapeNetwork, ShapeRecipe
@@ -210,6 +214,7 @@ def test_degenerate_triangles_needles_and_points_that_coincide_leave_no_nan() ->
         assert np.isfinite(value).all() and (value >= 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratios", [(0.02, 0.98, 0.0, 1.3), (1.0, 0.0, 0.0, 1.5), (0.9, 0.1, 0.9, 1.1)])
 def test_media_at_the_ends_of_the_range_stay_finite(ratios: tuple[float, ...]) -> None:
     for size in (1.0, 1000.0):

@@ -110,6 +110,7 @@ def test_a_rough_boundary_is_refused() -> None:
         mi.render(load_scene(scene(boundary=rough)), spp=1)
 
 
+@pytest.mark.slow
 def test_the_command_errors_measures_it_beside_a_half_space(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(model_errors, "reference", lambda *a: REFERENCE(a[0], 32, 1024, *a[3:]))

@@ -61,6 +61,7 @@ def test_objects_are_drawn_over_the_whole_range_and_not_beyond() -> None:
     assert SIZE[0] <= min(sizes) < 30 < max(sizes) <= SIZE[1]
 
 
+@pytest.mark.slow
 def test_data_repeat_and_have_a_mean_throughput_of_one() -> None:
     obj = draw_object((0, 4)).object
     one, two = (make_data(obj, mean_events(obj), (0, 4)) for _ in range(2))
@@ -69,6 +70,7 @@ def test_data_repeat_and_have_a_mean_throughput_of_one() -> None:
     assert np.isfinite(one.walks).all() and (one.W >= 0).all()
 
 
+@pytest.mark.slow
 def test_a_run_that_was_killed_ends_with_the_same_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(training, "CHECKPOINT_EVERY", 0.0)
     how = {"recipe": QUICK, "plan": PLAN, "seed": 2}

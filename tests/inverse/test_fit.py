@@ -185,6 +185,7 @@ def test_albedo_and_extinction_are_found_together_from_one_noisy_view(tmp_path: 
         assert np.abs((found.values[name] - true) / found.errors[name]).max() < 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [1.1, 0.5])
 def test_a_misfit_of_brightness_is_told(tmp_path: Path, factor: float) -> None:
     """With --exposure too, which leaves the brightness of all images together as it is."""

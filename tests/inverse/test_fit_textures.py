@@ -108,6 +108,7 @@ def test_pixels_know_the_texels_that_they_show(tmp_path: Path, kind: str) -> Non
     assert (wanted > 0.1).mean() > 0.3
 
 
+@pytest.mark.slow
 def test_what_is_dark_is_known_less_and_what_is_not_seen_is_not_known(tmp_path: Path) -> None:
     """A lamp at the left of the plate."""
     path = _mesh(tmp_path)
@@ -122,6 +123,7 @@ def test_what_is_dark_is_known_less_and_what_is_not_seen_is_not_known(tmp_path: 
     assert not seen[z < 0].any() and 2 * error[seen & (x < 0)].mean() < error[seen & (x > 0)].mean()
 
 
+@pytest.mark.slow
 def test_all_steps_of_a_fit_of_textures_run_the_same_kernels(tmp_path: Path) -> None:
     path, kernels = _bitmap(tmp_path, np.full((4, 4, 3), 0.8)), []
     view = GivenView.of("a", 0, np.full((12, 12, 3), 0.5, np.float32))
@@ -172,6 +174,7 @@ def test_a_fit_of_bytes_is_that_of_their_colours_and_bytes_of_a_scene_that_is_th
         inverse.fit(open_scene(path), [view], ("albedo",), model=None, settings=settings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["bitmap", "mesh"])
 def test_a_killed_fit_of_textures_goes_on_with_the_same_bits_and_writes_a_scene(tmp_path: Path, kind: str) -> None:
     path = _bitmap(tmp_path, np.full((4, 6, 3), 0.8)) if kind == "bitmap" else _mesh(tmp_path)

@@ -23,6 +23,7 @@ FORWARD = Medium.from_albedo(0.99, 1.0, 0.8, 1.5)
 SMALL = MapGrid(n_theta=3, n_phi=16, n_r=10, n_psi=8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "medium", [FIG10, FORWARD, Medium.from_albedo(0.6, 1.0, -0.5, 0.8)], ids=["fig10", "g0.8", "eta0.8"]
 )

@@ -158,6 +158,7 @@ def test_the_error_of_the_mean_of_other_seeds_is_noise_and_is_removed(
     assert abs(error.bias) < 0.02
 
 
+@pytest.mark.slow
 def test_what_is_left_of_the_error_of_the_truth_falls_with_the_events(monkeypatch: Any) -> None:
     """From 1.6e5 to 4e6 events noise falls fivefold, and with it what is left."""
     left = []

@@ -54,6 +54,7 @@ def test_blood_is_red() -> None:
     assert R[2] > 5 * R[0] and R[2] > 5 * R[1]
 
 
+@pytest.mark.slow
 def test_skin_gets_darker_from_type_to_type_most_in_the_blue() -> None:
     nm = (450.0, 550.0, 650.0)
     R = np.array(
@@ -73,6 +74,7 @@ def test_melanin_of_light_skin_absorbs_at_694_nm_as_was_measured(kind: str) -> N
     assert 0.29 < found < 1.2
 
 
+@pytest.mark.slow
 def test_skin_without_melanosomes_would_be_its_dermis() -> None:
     """A thin epidermis of nearly the same medium changes little: the layers meet the exact half-space."""
     kind = skin("I", thickness=1e-6)

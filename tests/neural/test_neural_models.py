@@ -40,6 +40,7 @@ def test_the_shipped_weights_are_small():
     assert size <= 300_000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("medium", [FIG10, Medium.from_albedo(0.99, 1.0, 0.5, 1.5)])
 def test_unseen_maps_are_met_better_than_by_any_dipole(medium):
     (reference,) = reference_maps([medium], ReferenceSize(1, CellGrid(40, 16), 4), 5e6, (31,))

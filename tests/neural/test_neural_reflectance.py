@@ -61,6 +61,7 @@ def _rings(medium: Medium, mu_i: float, edges: np.ndarray) -> np.ndarray:
     return np.histogram(found.r[0], edges, weights=found.flux[0])[0]
 
 
+@pytest.mark.slow
 def test_radial_profiles_of_the_table_are_met() -> None:
     rows: dict[tuple, list[Truth]] = {}
     for t in _bright(("ring",)):

@@ -80,6 +80,7 @@ def _batches(pool: MapPool) -> Source:
     return pool.batches(HOW.n_groups, HOW.n_queries)
 
 
+@pytest.mark.slow
 def test_a_trained_network_beats_its_untrained_start(pool: MapPool, reference: TracedMaps) -> None:
     training = MaterialTraining(warm=False)
     learner = training.learner(reference.medium, pool, 0)
@@ -111,11 +112,13 @@ def test_a_trained_universal_network_beats_its_untrained_start(reference: Traced
     assert error(learner) < 0.5 * before
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_weights(fig10: TrainedChannel, tmp_path: Path) -> None:
     (again,) = train(FIG10, recipe=RECIPE, seed=3, folder=tmp_path)
     assert again.path.read_bytes() == fig10.path.read_bytes() and again.error == fig10.error
 
 
+@pytest.mark.slow
 def test_another_seed_gives_other_weights(fig10: TrainedChannel, tmp_path: Path) -> None:
     (other,) = train(FIG10, recipe=RECIPE, seed=4, folder=tmp_path)
     assert other.path.read_bytes() != fig10.path.read_bytes()

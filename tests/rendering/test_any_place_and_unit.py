@@ -88,6 +88,7 @@ LEAF, BALL = (_box, (2, 2, 0.025)), (_ball, (2, 2, 2))
 AWAY = Frame((300, 200, -100), 1e3)  # in micrometres
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("thing", "integrator"), [(BALL, WALK), (LEAF, MODEL)], ids=["ball-walk", "leaf-model"])
 def test_a_scene_is_the_same_in_metres(thing: tuple, integrator: dict[str, Any]) -> None:
     known, other = (_image(frame, *thing, integrator, spp=32) for frame in (Frame(), Frame(scale=1e-3)))

@@ -67,6 +67,7 @@ def _regression(residuals: int, seed: int = 0) -> tuple[float, float, float]:
     return np.sqrt(np.square(found - wanted).sum(axis=1).mean() / whole), np.sqrt(squared.mean() / whole), bias
 
 
+@pytest.mark.slow
 def test_the_error_of_a_field_falls_with_the_residuals_and_is_told_within_a_factor_of_two() -> None:
     errors = [_regression(n) for n in (2**14, 2**17, 2**20)]
     found, told, along_normals = np.array(errors).T
@@ -166,6 +167,7 @@ def scene(gathered_once: Any) -> Any:
     return _with(gathered_once, Corrections())
 
 
+@pytest.mark.slow
 def test_a_medium_without_absorption_is_invisible_in_uniform_light() -> None:
     """All walks bring 1, what the model lacks is corrected whole."""
     scene = _scene("corrected", WHITE, {"sky": {"type": "constant"}}, hidden=False)
@@ -228,6 +230,7 @@ def test_a_medium_that_is_black_in_two_channels_has_the_light_of_walks_in_the_ot
     np.testing.assert_allclose(found, walked, rtol=0.05)
 
 
+@pytest.mark.slow
 def test_walks_are_added_for_an_image_of_more_samples_and_kept_for_one_of_fewer(scene: Any, few: None) -> None:
     walks = []
     for spp in (16, 2**11, 16):
@@ -265,6 +268,7 @@ def test_the_same_seed_gives_the_same_image(scene: Any, few: None) -> None:
     np.testing.assert_allclose(one, two, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_light_is_corrected_anew_when_an_emitter_was_edited(scene: Any, few: None) -> None:
     before = _image(scene, 16)
     parameters = mi.traverse(scene)

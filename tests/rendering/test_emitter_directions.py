@@ -72,6 +72,7 @@ def light_along(d: np.ndarray, lamp: tuple) -> np.ndarray:
     return value * np.exp(-SIGMA_T[:, None] * DEPTH / d[2])
 
 
+@pytest.mark.slow
 def test_sampled_directions_and_chance_share_the_light_of_lamps_between_them() -> None:
     """What sampled directions bring is what the weights of directions drawn by chance, in (0, 1), leave to it."""
     found, (d, solid) = directions(), upwards()

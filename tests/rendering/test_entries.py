@@ -42,6 +42,7 @@ def scene_of(light: str, entries: int, **beside: dict) -> dict:
     }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("light", LIGHTS)
 def test_several_entries_give_the_light_of_one(light):
     (one, one_error), (four, four_error) = (mean_of_pixels(scene_of(light, entries), spp=256) for entries in (1, 4))
@@ -49,6 +50,7 @@ def test_several_entries_give_the_light_of_one(light):
     assert np.all(np.abs(four / one - 1) < 0.03)
 
 
+@pytest.mark.slow
 def test_directions_that_a_sky_chooses_give_the_same_light_with_less_noise():
     grey, down = {"type": "diffuse"}, mi.ScalarTransform4f().translate([0, -1.02, 0]).rotate([1, 0, 0], -90).scale(3)
     floor, means, errors = {"type": "rectangle", "to_world": down, "bsdf": grey}, [], []

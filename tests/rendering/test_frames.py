@@ -40,6 +40,7 @@ def _gathered(scene: mi.Scene) -> Any:
     return scene.integrator().prepare(scene)[0].gathered
 
 
+@pytest.mark.slow
 def test_light_is_found_anew_only_where_something_changed_and_does_not_flicker(dim: dict) -> None:
     from full_geometry.scenes.scene_files import open_scene
     from full_geometry.viewing.frames import frames

@@ -59,6 +59,7 @@ def test_precomputed_light_of_two_media_has_the_mean_of_sampled_light() -> None:
     assert (np.abs(found - truth) < 0.005 * truth + 4 * error).all(), (found / truth, error / truth)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file", WALKED)
 def test_nothing_that_does_not_absorb_is_seen_in_uniform_light(file: str) -> None:
     """Models refuse what lies inside or overlaps: walks see 1 everywhere where nothing is lost."""

@@ -84,6 +84,7 @@ def _pictures(model: str, light: str) -> tuple[np.ndarray, ...]:
 CASES = [("better_dipole", "lamp"), ("neural", "point"), pytest.param("better_dipole", "floor", marks=pytest.mark.slow)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("model", "light"), CASES)
 def test_it_is_as_bright_as_the_model_sampled_within_3_percent(model: str, light: str) -> None:
     a, b, one, two = (image.mean(axis=(0, 1)) for image in _pictures(model, light))
@@ -91,6 +92,7 @@ def test_it_is_as_bright_as_the_model_sampled_within_3_percent(model: str, light
     assert (np.abs((one + two) / (a + b) - 1) < 0.03 + 4 * noise / (a + b)).all()
 
 
+@pytest.mark.slow
 def test_it_is_as_bright_as_the_model_sampled_where_the_index_is_below_that_outside() -> None:
     """Wax in glass: beyond the critical angle outside no direction is bent inwards, and none counts."""
     wax = {**MEDIUM, "eta": 0.9}
@@ -108,6 +110,7 @@ def test_its_pixels_differ_from_the_model_sampled_by_6_percent_at_most(model: st
     assert (np.sqrt(np.maximum(square, 0)) / a.mean(axis=(0, 1)) < 0.06).all()
 
 
+@pytest.mark.slow
 def test_textures_are_as_bright_as_the_model_sampled_on_both_sides_of_an_edge() -> None:
     """Each half of a sphere, and its rows beside the edge, which are 40 % off if the medium of the exit is left out.
 
@@ -127,6 +130,7 @@ def test_textures_are_as_bright_as_the_model_sampled_on_both_sides_of_an_edge() 
     assert np.abs(np.log(a[1] / a[2])).max() > 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:object")
 def test_a_medium_that_varies_is_as_bright_as_the_model_sampled() -> None:
     values = np.random.default_rng(1).uniform(0.5, 2, (3, 3, 3, 3)).astype(np.float32)
@@ -187,6 +191,7 @@ def test_light_that_is_not_finite_is_refused_by_emitter_and_texel(integrator: st
         mi.render(scene, integrator=found, spp=1)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("little_light")
 @pytest.mark.parametrize("lights", [{"sky": {"type": "constant", "radiance": 0.0}}, {}])
 def test_black_light_and_none_leave_a_mesh_of_few_faces_black(lights: dict) -> None:
@@ -265,6 +270,7 @@ def test_s_leans_towards_the_other_end_by_a_network_and_not_by_a_dipole() -> Non
     assert (by_network[1:, :, 1] < -0.25).all()
 
 
+@pytest.mark.slow
 def test_every_place_of_a_surface_in_rows_of_faces_has_a_point_in_reach() -> None:
     # of the set of points alone 6 and 13 % had none, and were black
     def even_box(p: np.ndarray) -> np.ndarray:
@@ -341,6 +347,7 @@ def _laser_at(place: tuple[float, float]) -> tuple[Any, FineLight]:
     return obj, fine_light(scene, obj.instance_scene, obj, obj.gathered.matrix)
 
 
+@pytest.mark.slow
 def test_a_laser_finer_than_the_points_keeps_its_flux_and_is_told() -> None:
     """It was lost at this place. Σ A W L is a(mu) times the power within 0.5 %, and what leaves ρ of that."""
     place = -0.33, 0.17
@@ -358,6 +365,7 @@ def test_a_laser_finer_than_the_points_keeps_its_flux_and_is_told() -> None:
     )
 
 
+@pytest.mark.slow
 def test_stripes_are_blended_between_points_with_the_contrast_that_they_have_there() -> None:
     """Of stripes five distances of points apart a fifth was lost between these."""
     obj, fine = _laser_at((0.1, 0.2))
@@ -371,6 +379,7 @@ def test_stripes_are_blended_between_points_with_the_contrast_that_they_have_the
     assert (blurred < 0.89 * there).all() and (np.abs(sharp / there - 1) < 0.05).all()
 
 
+@pytest.mark.slow
 def test_a_laser_is_as_bright_as_sampled_within_3_percent() -> None:
     """It was 1.76 times as bright."""
     light = _laser(0.4, -0.3, 0.6)

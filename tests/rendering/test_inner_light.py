@@ -138,6 +138,7 @@ def test_an_object_of_very_many_mean_free_paths_has_its_events_traced() -> None:
     assert inner.Events.of(_ball(sigma_s=np.full(3, 1000.0)), 2**16) is None
 
 
+@pytest.mark.slow
 def test_light_inside_follows_an_emitter_that_was_edited() -> None:
     scene = _scene({"lamp": LAMP})
     before, parameters = _image(scene, 16, 1), mi.traverse(scene)

@@ -148,6 +148,7 @@ LIGHTS: dict[str, Callable[[], tuple[dict, dict[str, str]]]] = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", LIGHTS)
 def test_emitters_inside_are_seen_as_by_the_volume_path_tracer_of_mitsuba(kind: str) -> None:
     inside, holders = LIGHTS[kind]()
@@ -195,6 +196,7 @@ def _all_around(nodes: np.ndarray, width: float) -> dict:
     return sensors
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", AROUND)
 def test_all_light_of_a_point_light_in_a_medium_without_absorption_leaves_it(kind: str) -> None:
     """The mean over directions of the integral of radiance across each is the intensity; no camera sees a point."""
@@ -219,6 +221,7 @@ def test_lamps_outside_are_found_by_chance_and_for_empty_objects_beside_by_conne
     _agree(_means(mi.load_dict(scene), 2048, 1), _means(_theirs(scene, holders), 2048, 1001), 0.02)
 
 
+@pytest.mark.slow
 def test_a_medium_that_varies_has_a_stone_inside() -> None:
     grid = np.random.default_rng(5).uniform(0.5, 2.0, (4, 4, 4, 1)).astype(np.float32)
     at = mi.ScalarTransform4f().translate(-1).scale(2)

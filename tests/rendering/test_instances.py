@@ -122,6 +122,7 @@ def test_an_even_sky_stays_even_over_instances_nested_three_deep_that_absorb_not
     assert (np.abs(means.mean(axis=0) - 1) < WIDEST_Z * error).all() and (error < 0.01).all()
 
 
+@pytest.mark.slow
 def test_a_thousand_instances_are_made_ready_by_the_launches_of_a_few() -> None:
     def kernels(n: int) -> int:
         grid = [mi.ScalarTransform4f().translate([2.3 * (k % 40), 2.3 * (k // 40), -3]) for k in range(n)]
@@ -135,6 +136,7 @@ def test_a_thousand_instances_are_made_ready_by_the_launches_of_a_few() -> None:
     assert many <= few + 4  # pairs of neighbours are looked at in parts
 
 
+@pytest.mark.slow
 def test_a_hit_on_an_instance_is_what_mitsuba_makes_of_it() -> None:
     parts = {"box": box(), "ball": {"type": "sphere", "radius": 0.5, "center": [0, 0, 0.9]}}
     scaled = [turned(2.3 * k, 40 * k) @ mi.ScalarTransform4f().scale([1, 1.3, -0.7]) for k in range(4)]
@@ -250,6 +252,7 @@ def test_derivatives_of_a_model_by_the_medium_of_instances_are_those_of_objects_
     agree_in_slopes("bssrdf", surface("better_dipole", "total", medium=DENSE), "albedo")
 
 
+@pytest.mark.slow
 def test_a_thousand_instances_are_rendered_by_the_kernels_of_a_few() -> None:
     def kernels(n: int) -> int:
         grid = [mi.ScalarTransform4f().translate([2.3 * (k % 40), 2.3 * (k // 40), -3]) for k in range(n)]

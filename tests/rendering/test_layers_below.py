@@ -52,6 +52,7 @@ def test_depths_are_distances_to_the_nearest_point_of_the_surface(kind: str) -> 
     assert error[depth[shallow] < 0.03].max() < (0.001 if kind == "sphere" else 0.01)  # edges lie between nodes
 
 
+@pytest.mark.slow
 def test_a_large_ball_reflects_what_the_same_layers_below_a_plane_do() -> None:
     scene = _scene(40.0, "skin III", type="translucent_walk")
     image = np.array(mi.render(scene, spp=256, seed=3))

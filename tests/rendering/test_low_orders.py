@@ -62,6 +62,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shape", "medium", "light"), CASES.values(), ids=CASES)
 @pytest.mark.filterwarnings("ignore:object:UserWarning")
 def test_orders_below_two_are_those_of_walks(only_few: None, shape: str, medium: dict, light: str | None) -> None:

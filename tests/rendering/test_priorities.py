@@ -98,6 +98,7 @@ def _poured(folder: Path, priority: float) -> tuple[dict, dict]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "built",
     [_sunk, lambda path: _poured(path, -1.0), lambda path: _poured(path, 1.0)],
@@ -131,6 +132,7 @@ def _copies(*places: float, bsdf: dict = CREAM) -> dict:
     return things
 
 
+@pytest.mark.slow
 def test_an_even_sky_stays_even_over_overlaps_that_absorb_nothing() -> None:
     """A ball in a block that holds a bubble and overlaps glass, all around a white stone, and two instances."""
     white = {**JELLY, "sigma_t": "2", "albedo": "1"}
@@ -147,6 +149,7 @@ def test_an_even_sky_stays_even_over_overlaps_that_absorb_nothing() -> None:
     assert abs(found.mean() - 1) < 5e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("light", ["precomputed", "sampled"])
 def test_an_object_whose_normals_point_inwards_looks_the_same_beside_an_overlap(light: str) -> None:
     def image(**turned: bool) -> np.ndarray:

@@ -95,6 +95,7 @@ def _by_chance(folder: Path, orders: str, light: dict) -> tuple[reference.Refere
     return reference.load(folder / "a.exr"), np.stack(images)
 
 
+@pytest.mark.slow
 def test_light_that_orders_below_two_meet_by_chance_is_told_as_a_share_of_the_variance(tmp_path: Path) -> None:
     sky = {"type": "constant"}
     lamp = {"type": "sphere", "center": [1, 3, 3], "radius": 0.2, "emitter": {"type": "area", "radiance": 100.0}}

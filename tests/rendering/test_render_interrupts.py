@@ -60,6 +60,7 @@ def scene_of(kind: str, size: int, sampler: str = "independent"):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["bssrdf", "translucent_walk"])
 def test_an_interrupt_is_heard_early_and_late_in_a_launch_and_so_is_the_next_one(integrator: str) -> None:
     for _ in range(2):  # once more where other tests held the cores

@@ -51,6 +51,7 @@ def test_derivatives_by_the_medium_agree_with_finite_differences_for_every_model
 FLOOR = "floor.bsdf.reflectance.color1.value"
 
 
+@pytest.mark.slow
 def test_derivatives_under_a_lamp_agree_with_finite_differences_and_with_the_image_by_the_light():
     """By each channel of the medium and the texture of another surface; what light shows is linear in it."""
     scene, light = make("lamp"), "light.emitter.radiance.value"
@@ -82,6 +83,7 @@ def test_the_radiance_of_a_constant_sky_times_its_derivative_is_the_image(model)
     assert backward(scene, "light.radiance.value").sum() == pytest.approx(expected, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_forward_and_backward_derivatives_agree():
     scene = make(orders="total", reflection=True)
     for key, found in derivatives(scene, ["light.radiance.value", FLOOR, "ball.bsdf.albedo"]).items():
@@ -135,6 +137,7 @@ def _painted(model: str) -> mi.Scene:
                    "to_world": at.look_at((30 * direction(50)).tolist(), [0, 0, 0], [0, 0, 1])}})  # fmt: skip
 
 
+@pytest.mark.slow
 def test_derivatives_by_textures_of_a_medium_agree_with_finite_differences():
     scene = _painted("standard_dipole")
     bodies = scene.integrator().prepare(scene)

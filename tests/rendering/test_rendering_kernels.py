@@ -73,6 +73,7 @@ def test_a_kernel_serves_other_crops_of_a_film(model):
     assert len(kernels) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("model", "light"), [("better_dipole", "gathered"), ("path_traced", "precomputed")])
 def test_a_scene_again_compiles_nothing_wherever_numpy_has_put_its_numbers(model, light):
     hashes, kept = [], []

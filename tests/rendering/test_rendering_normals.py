@@ -81,6 +81,7 @@ def same(a: np.ndarray, b: np.ndarray) -> None:
     assert p.min() * p.size > 1e-4
 
 
+@pytest.mark.slow
 def test_a_mesh_with_normals_looks_the_same_however_it_is_wound_flipped_and_mirrored(tmp_path):
     upright = image(mesh(tmp_path, False, True), "lamp")
     for reverse, flip, mirror in ((True, False, False), (False, True, False), (False, False, True), (True, True, True)):
@@ -107,6 +108,7 @@ def test_a_constant_sky_is_nowhere_outshone(tmp_path):
         assert image(mesh(tmp_path, reverse, normals), "sky").mean(axis=0).max() < 1.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["bssrdf", "translucent_walk"])
 def test_each_piece_of_a_mesh_has_its_own_outside(integrator, tmp_path):
     """One of two bodies in a file is wound the other way: the file is rendered as if it were not."""

@@ -111,6 +111,7 @@ def grid(radius: float) -> object:
     return mi.TensorXf((np.linalg.norm(x, axis=-1) - radius)[..., None].astype(np.float32))
 
 
+@pytest.mark.slow
 def test_a_distance_field_looks_like_the_sphere_that_it_is_of():
     at = mi.ScalarTransform4f()
     bsdf = {**surface(orders="total"), "reflection": True}

@@ -170,6 +170,7 @@ def test_media_by_textures_name_the_weights_that_their_networks_come_from(tmp_pa
     assert _learnt(text, tmp_path) == [checksum_of(shipped_weights(), "neural")]
 
 
+@pytest.mark.slow
 def test_gathered_light_is_known_by_the_weights_too(tmp_path) -> None:
     text = XML.replace("better_dipole", "neural")
     light = '<integrator type="bssrdf"><string name="light" value="gathered"/></integrator>'

@@ -100,6 +100,7 @@ def _scene(thin: bool, side: int) -> mi.Scene:
     })  # fmt: skip
 
 
+@pytest.mark.slow
 def test_both_sides_look_as_walks_in_a_thin_box(mono: None) -> None:
     """Lit from one side at 50 degrees by a lamp of 27 degrees."""
     for side in (1, -1):

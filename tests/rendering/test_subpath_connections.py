@@ -163,6 +163,7 @@ def test_shading_normals_bend_the_light_and_geometric_ones_hold_its_width(theta,
     agree(brought(connections, depth), scattered([beam], depth, g, albedo), known_to=0.02)
 
 
+@pytest.mark.slow
 def test_connections_bring_the_light_of_a_point_that_comes_steeply() -> None:
     depth, g, intensity, lamp = 0.7, 0.3, 200.0, np.array([0.3, 0.2, 0.3])
     connections = connections_of({"lamp": {"type": "point", "position": lamp.tolist(), "intensity": intensity}}, g)

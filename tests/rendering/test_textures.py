@@ -174,6 +174,7 @@ def test_networks_are_asked_at_all_distances_or_between_few(count: int) -> None:
         np.testing.assert_allclose(linear, np.log(r), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_model_of_a_constant_texture_renders_as_of_a_constant() -> None:
     """The same bits; and derivatives by its texels are known after an image without them."""
     images = []

@@ -127,6 +127,7 @@ def _lit(gap: float, kind: str, integrator: str = "translucent_walk") -> mi.Scen
     return _view(integrator, {"type": "constant", "radiance": 0.0}, block=block, lamp=_lamp(gap, kind))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("side", "kind"), [(1, "box"), (-1, "rectangle")], ids=["outside", "inside"])
 def test_a_lamp_at_a_surface_is_as_bright_at_every_gap(side: int, kind: str) -> None:
     """On each side: inside no light is lost at the boundary. Most paths of a seed are the same."""

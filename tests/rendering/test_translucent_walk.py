@@ -127,6 +127,7 @@ def _top_of_ball(away: float, mu: float, light: dict, **surface: Any) -> dict:
     return scene
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("orders", ["single", "multiple"])
 def test_a_large_ball_far_from_the_origin_shows_the_reflectance_of_the_half_space(orders: str) -> None:
     images = _runs(mi.load_dict(_top_of_ball(1000.0, 0.6, {"type": "constant"}, orders=orders)), 16, 512, 1)

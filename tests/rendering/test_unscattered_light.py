@@ -203,6 +203,7 @@ def test_the_fit_keeps_the_integral_over_cells_that_share_it() -> None:
 # ---- images
 
 
+@pytest.mark.slow
 def test_a_medium_without_absorption_is_invisible_in_uniform_light() -> None:
     means = _means(_scene("precomputed", WHITE, light={"type": "constant"}), 8, 512, 1)
     error = means.std(axis=0, ddof=1) / np.sqrt(len(means))
@@ -342,6 +343,7 @@ def test_precomputed_light_of_a_lamp_has_the_mean_of_sampled_light_where_scatter
         _compare({**MEDIUM, "g": 0.9}, 0.02, _ball(2.0), spp=6144, **lamp)
 
 
+@pytest.mark.slow
 def test_light_of_a_window_has_a_fraction_of_the_noise_of_sampled_light() -> None:
     sky = np.full((32, 64, 3), 0.1, dtype=np.float32)
     sky[6:12, 8:14] = 20
@@ -352,6 +354,7 @@ def test_light_of_a_window_has_a_fraction_of_the_noise_of_sampled_light() -> Non
     assert noise[0] < 0.05 * noise[1]  # .06 if walks went on beyond their third event
 
 
+@pytest.mark.slow
 def test_the_mirror_image_of_a_lamp_that_fills_a_small_part_of_a_pixel_is_found(tmp_path: Path) -> None:
     """F L times the area of the image in a mirror of focal length R / 2, in pixels; R = 5, the lamp 29 away, F = 0.0293
     at 31 degrees. A fifty thousandth of a pixel, on a mesh."""
@@ -397,6 +400,7 @@ def test_an_edited_emitter_lights_the_next_picture() -> None:
     assert np.array(mi.render(scene, spp=16, seed=1)).mean() == pytest.approx(2 * before, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_an_object_of_another_medium_has_other_cells() -> None:
     scene = _scene("precomputed", MEDIUM, lamp=_lamp())
     mi.render(scene, spp=1)
@@ -453,6 +457,7 @@ def test_a_light_that_does_not_exist_is_refused() -> None:
         mi.load_dict({"type": "translucent_walk", "light": "grid"})
 
 
+@pytest.mark.slow
 def test_a_floor_has_the_light_of_a_delta_light_in_the_mirror_of_an_object() -> None:
     """A spot that shines on a cube alone: its mirror image is met by cones about the light, wide ones here."""
     T = mi.ScalarTransform4f()

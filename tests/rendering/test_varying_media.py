@@ -43,6 +43,7 @@ def _varying(**more: Any) -> dict:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("surface", "shape"),
     [
@@ -85,6 +86,7 @@ def test_null_collisions_change_nothing() -> None:
     assert np.abs(_z(a, b)).max() < WIDEST_Z
 
 
+@pytest.mark.slow
 def test_connections_and_directions_bring_the_light_that_chance_brings() -> None:
     surface = _varying(reflection=False, g=0.0)
     joined, left_to_chance = (
@@ -186,6 +188,7 @@ def test_objects_that_vary_and_homogeneous_ones_stand_in_one_scene() -> None:
     assert np.abs(_z(_runs(mi.load_dict(scene), 6, 128, 1), _runs(theirs, 6, 128, 100))).max() < WIDEST_Z
 
 
+@pytest.mark.slow
 def test_a_mono_variant_takes_grids_of_one_channel() -> None:
     mi.set_variant("llvm_ad_mono")
     surface = {"sigma_t": _grid(_cloud(1, 0.1, 2.0)), "albedo": _grid(_cloud(1, 0.7, 0.99, 2)), "g": 0.4}

@@ -66,6 +66,7 @@ def _last(live: LiveScene, camera: Camera, way: Way) -> Shown:
     return list(itertools.islice(live.passes(camera, way), 3))[-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("edits", "kept"),
     [

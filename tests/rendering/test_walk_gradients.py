@@ -163,6 +163,7 @@ def _gradients(scene: mi.Scene, endings: tuple[str, ...], seed: int = 3, spp: in
     return np.array([np.sum(each, axis=0) for each in slopes])
 
 
+@pytest.mark.slow
 def test_derivatives_by_vertices_add_up_to_those_by_a_constant(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the same paths: kernels differ by rounding, by which few paths take another way."""
     monkeypatch.setattr(scores, "SLOTS", 8)

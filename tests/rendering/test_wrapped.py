@@ -51,6 +51,7 @@ def same(a: np.ndarray, b: np.ndarray) -> None:
     assert often.mean() > 0.5 and p.min() * p.size > 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_wrappers_without_content_change_nothing(integrator):
     plain = images(PLAIN, integrator)

@@ -114,6 +114,7 @@ def test_matched_isotropic_diffuse_reflectance_is_chandrasekhars():
     assert distance(*R, 1 - 2 * math.sqrt(0.1) * np.sum(0.5 * weights * mu * H(mu, 0.9)), 1e-8) < 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("albedo", "mu_i"), [(0.5, 0.5), (0.95, 0.2), (1.0, 1.0)])
 def test_matched_isotropic_radiance_is_chandrasekhars(albedo, mu_i):
     mu_o = np.array([0.1, 0.4, 0.7, 1.0])

@@ -195,6 +195,7 @@ def windows() -> np.ndarray:
     return pixels
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("little_light")
 def test_the_second_look_goes_on_with_the_samples_of_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
     known: list[tuple[Technique, int, Any]] = []
@@ -267,6 +268,7 @@ def _found(*ways: tuple[str, float, float]) -> Assessment:
 CHANCE, QUICKER = ("path_traced", 0.0, 1e-5), ("path_traced, precomputed", 0.0, 1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("little_light")
 @pytest.mark.parametrize("arguments", [["--model", "auto", "--spp", "1"], ["--target-error", "0.5"]])
 def test_the_command_takes_the_cheapest_way_where_that_is_left_to_it_and_finds_it_again(
@@ -298,6 +300,7 @@ def test_auto_inside_the_integrator_of_models_refuses_what_none_of_them_keeps(mo
         loaded.integrator().prepare(loaded)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("little_light")
 def test_auto_takes_corrected_light_of_a_clear_object(monkeypatch: pytest.MonkeyPatch) -> None:
     """Objects are made for the light that is chosen: gathered light of this one is refused."""
@@ -316,6 +319,7 @@ def _painted(*albedos: float) -> dict[str, Any]:
     return {"albedo": bitmap, "sigma_t": 10.0}
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("little_light")
 def test_a_textured_object_is_assessed_by_the_ways_that_take_it() -> None:
     """A texture of one colour is as far from walks as its medium; others of two colours say what they refuse."""
@@ -356,6 +360,7 @@ def test_auto_is_chosen_once_kept_and_found_again(tmp_path: Path) -> None:
         damaged.integrator().prepare(damaged)
 
 
+@pytest.mark.slow
 def test_denoised_walks_are_told_with_what_is_left_of_their_noise() -> None:
     pytest.importorskip("mitsuba_oidn")
     lit = scene(light={"type": "envmap", "bitmap": mi.Bitmap(windows())})
