@@ -15,6 +15,7 @@ import numpy as np
 
 from full_geometry.geometry.instances import InstanceTable, corners, ends_of, shapes_of, shown_groups
 from full_geometry.geometry.points import floats
+from full_geometry.geometry.rounding import bound_of
 from full_geometry.geometry.shape import Geometry, is_inside, meet_alone, name_of, ray_of_arrays, scene_of, ways_into
 from full_geometry.surface.sheets import is_sheet
 from full_geometry.surface.wrapped import surface_of
@@ -239,6 +240,26 @@ def _check_apart(pairs: _Pairs, of: tuple[mi.Shape, mi.Scene], holder: Geometry,
                 f"surfaces must be apart by more than {part.deep[shared.argmax()]:.2g} scene units, outside or inside, "
                 f"got the shape {name_of(shape)} on the surface of object {holder.name}"
             )
+
+
+def check_lamps(scene: mi.Scene) -> None:
+    """ValueError if lamps lie on each other, as copies do: rays meet one of them, samples of emitters find both."""
+    # ---- lamps of the same box, up to rounding
+    lamps, alike = [lamp for lamp in map(mi.Emitter.get_shape, scene.emitters()) if lamp is not None], {}
+    boxes = np.array([[*lamp.bbox().min, *lamp.bbox().max] for lamp in lamps], dtype=float).reshape(-1, 6)
+    sizes = np.linalg.norm(boxes[:, 3:] - boxes[:, :3], axis=1)
+    for lamp, box, size in zip(lamps, boxes, sizes):
+        alike.setdefault((f"{size:.3g}", *np.round(box / (DEEP * size))), []).append(lamp)
+
+    # ---- of these, whether they share their surfaces
+    for one, *others in alike.values():
+        for other in others:
+            close = np.full(1, CLOSE * bound_of(one))
+            if _shares(other, scene_of([one], scene), np.eye(4)[None], close, LOOKS).any():
+                raise ValueError(
+                    f"lamps must be apart by more than {close[0]:.2g} scene units, got the shape {name_of(other)} on "
+                    f"the shape {name_of(one)}"
+                )
 
 
 def _shares(shape: mi.Shape, other: mi.Scene, into: np.ndarray, close: np.ndarray, looks: int) -> np.ndarray:

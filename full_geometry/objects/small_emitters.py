@@ -22,6 +22,7 @@ import numpy as np
 
 from full_geometry.geometry.rounding import before, blocked, bound_of
 from full_geometry.geometry.shape import by_pointer, looked_up, pointer_numbers
+from full_geometry.objects.inclusions import check_lamps
 from full_geometry.surface.wrapped import surface_of
 
 # ---- Suns of an environment map -------------------------------------------------------------------------------------
@@ -256,7 +257,9 @@ def is_delta(emitter: mi.Emitter) -> bool:
 
 def check_emitters(scene: mi.Scene) -> None:
     """Refuse emitters that do not work, and warn of those that no path from a camera finds.
-    ValueError for an emitter that Mitsuba's own path tracers cannot evaluate either, or light that is not finite."""
+    ValueError for an emitter that Mitsuba's own path tracers cannot evaluate either, for light that is not finite, or
+    as of `check_lamps`."""
+    check_lamps(scene)
     for emitter in scene.emitters():
         _check_finite(emitter)
         kind = emitter.class_name()

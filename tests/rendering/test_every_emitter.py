@@ -21,7 +21,7 @@ mi = pytest.importorskip("mitsuba")
 import drjit as dr  # noqa: E402
 
 from full_geometry import register  # noqa: E402
-from full_geometry.objects.small_emitters import SmallEmitters  # noqa: E402
+from full_geometry.objects.small_emitters import SmallEmitters, check_emitters  # noqa: E402
 from full_geometry.trade import recommend  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -276,6 +276,24 @@ def test_emitters_that_path_tracers_cannot_find_are_named(integrator: str) -> No
     scene = mi.load_dict(_scene({"type": integrator}, {"lamp": lamp}, model="better_dipole"))
     with pytest.warns(UserWarning, match="light of a DirectionalArea is left out"):
         assert np.array(mi.render(scene, spp=1)).max() == 0
+
+
+@pytest.mark.parametrize("turned", [0.0, 180.0], ids=["copies", "back to back"])
+@pytest.mark.parametrize("integrator", ["translucent_walk", "bssrdf"])
+def test_lamps_on_each_other_are_refused_by_name(integrator: str, turned: float) -> None:
+    at = _looking(PLACE)
+    lamps = {name: {"type": "rectangle", "to_world": to_world, "emitter": {"type": "area"}}
+             for name, to_world in {"one": at, "other": at.rotate([0, 1, 0], turned)}.items()}  # fmt: skip
+    scene = mi.load_dict(_scene({"type": integrator}, lamps, model="better_dipole"), optimize=False)
+    with pytest.raises(ValueError, match="lamps must be apart by more than .*'(one|other)' on the shape '(one|other)'"):
+        mi.render(scene, spp=1)
+
+
+def test_lamps_that_cross_in_one_box_are_taken() -> None:
+    at = mi.ScalarTransform4f().translate(PLACE.tolist())
+    lamps = {name: {"type": "rectangle", "to_world": at.rotate([0, 1, 0], turn), "emitter": {"type": "area"}}
+             for name, turn in {"one": 45.0, "other": -45.0}.items()}  # fmt: skip
+    check_emitters(mi.load_dict({"type": "scene", **lamps}))
 
 
 @pytest.mark.parametrize("integrator", ["translucent_walk", "bssrdf"])
