@@ -366,8 +366,8 @@ class LightVisitor:
         before = record
         record = replace(record, previous=crossing.si.p, pdf=crossing.pdf, delta=crossing.delta)
         if self.unscattered is not None:  # `emitter_behind` knows no reflections
-            reflected = crossing.reflected(self.media, walk.d) & (walk.order > 0)
-            record = replace(record, precomputed=record.precomputed & (crossing.leaves | reflected))
+            brings = crossing.brings(self.media, walk.d) & (walk.order > 0)
+            record = replace(record, precomputed=record.precomputed & (crossing.leaves | brings))
         if self.forward:
             record = replace(record, run=record.run.onward(crossing.along))
 

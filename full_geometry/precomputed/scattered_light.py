@@ -216,7 +216,7 @@ class ScatteredLight(Visitor):
     def crossing(self, walk: Walk, path: LightPath, crossing: Crossing) -> tuple[Walk, LightPath]:
         stays = crossing.reflected(self.media, walk.d)
         weight = dr.select(stays, walk.weight, walk.weight * adjoint(crossing.si, crossing.along, walk.d))
-        return replace(walk, weight=weight), replace(path, direct=path.direct & stays)
+        return replace(walk, weight=weight), replace(path, direct=path.direct & crossing.brings(self.media, walk.d))
 
 
 def adjoint(si: mi.SurfaceInteraction3f, along: mi.Vector3f, d: mi.Vector3f) -> mi.Float:

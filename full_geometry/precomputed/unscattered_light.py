@@ -7,7 +7,8 @@ reflected inside, bring it to the cells of a grid, once for an image. A walk the
     weight ∫ p(w.w') L_0(x, w') dw',
 
 and drops the emitters that it meets after its last event as long as it has met nothing but the boundary of the object
-since, as the grid holds their light. Light that comes by way of other surfaces, of those inside the object too, or
+since, as the grid holds their light. Where objects lie in others and nothing overlaps, rays go on from one to another,
+and walks may meet these boundaries too. Light that comes by way of other surfaces, of those inside the object too, or
 through another part of the object, stays to be met by chance.
 
 Rays begin at points uniform over the surface, each with one sample of the emitters. Along a ray six points are drawn by
@@ -43,8 +44,9 @@ from full_geometry.geometry.points import EntrySample, opaque, sided
 from full_geometry.precomputed.forward_scattering import kept_forward, quadratic_part, split_extinction, truncated
 from full_geometry.precomputed.inside_cells import RIDGE, CellIndex, InsideCells, cell_edge
 from full_geometry.precomputed.lit_points import bend, entries, lit_points, multiples, to_world
-from full_geometry.precomputed.scattered_light import ScatteredLight
+from full_geometry.precomputed.scattered_light import ScatteredLight, adjoint
 from full_geometry.precomputed.transport_matrix import R_2
+from full_geometry.walk.emission import MOST_SURVIVAL
 from full_geometry.walk.media import WalkMedia
 from full_geometry.walk.random_walk import Event, fly, free_path, pick, sample_bsdf, turn
 from halfspace_sss.physics.medium import Medium
@@ -123,20 +125,42 @@ def unscattered_light(
     """Unscattered light of the emitters of a scene.
     `cells`: of the objects, from `inside_cells_of`. `rays`: of light, for each object. `paths`: of scattered light, all
     objects together; 0 leaves that to walks."""
-    # ---- trace light into the cells of each object, fit its fluence and directions, and put all into one table
+    # ---- trace light into the cells of all objects
     n = len(mi.Spectrum(0))
     directional = any(np.any(inside.medium.g) for inside in media.specs)
-    bricks, slots, fluence, directions = [], [], [], []
-    rows: dict[str, list] = {"first": [], "low": [], "scale": [], "counts": []}
-    bricks_before, cells_before, slots_before = 0, 0, 0
-    for k, grid in enumerate(cells):
-        D, w = _moments(scene, media, k, grid, seed, rays, directional)
+    index, tables = _in_one_table(cells)
+    sizes = [4 * n, 8 * n] if directional else [4 * n]
+    whole = [dr.zeros(mi.Float, size * sum(grid.slots for grid in cells)) for size in sizes]
+    tracer = _Rays(scene, media, index, tables, whole[0], whole[1] if directional else None, forward(media))
+    for k in range(len(cells)):
+        tracer.trace(k, rays, seed)
+
+    # ---- fit the fluence and directions of each
+    first, fluence, directions = 0, [], []
+    for grid in cells:
+        D, *w = (_part(values, size * first, size * grid.slots) for values, size in zip(whole, sizes))
+        first += grid.slots
         grid.share(D, 4 * n, moments=True)
         if directional:
-            grid.share(w, 8 * n)
-            directions.append(_directions(w, D))
+            grid.share(w[0], 8 * n)
+            directions.append(_directions(w[0], D))
         grid.fit(D)
         fluence.append(D)
+    light = _joined(fluence), _joined(directions) if directional else None
+    dr.make_opaque(light)
+    found = UnscatteredLight(index, *light, tables, forward(media))
+    if paths:
+        found = _with_paths(scene, media, seed, found, cells, paths)
+    dr.sync_thread()  # callers time this
+    return found
+
+
+def _in_one_table(cells: list[InsideCells]) -> tuple[CellIndex, dict[str, Any]]:
+    """The index of the cells of all objects, one after the other, and the tables of `UnscatteredLight`."""
+    bricks, slots = [], []
+    rows: dict[str, list] = {"first": [], "low": [], "scale": [], "counts": []}
+    bricks_before, cells_before, slots_before = 0, 0, 0
+    for grid in cells:
         brick, slot = grid.index.brick, grid.index.slot
         bricks.append(dr.select(brick >= 0, brick + dr.opaque(mi.Int32, 2 * cells_before), -1))
         slots.append(dr.select(slot >= 0, slot + dr.opaque(mi.Int32, slots_before), -1))
@@ -150,13 +174,8 @@ def unscattered_light(
     tables["low"] = mi.Point3f(*(mi.Float([float(v) for v in axis]) for axis in np.transpose(rows["low"])))
     tables["counts"] = mi.Vector3i(*(mi.Int32([int(v) for v in axis]) for axis in np.transpose(rows["counts"])))
     index = CellIndex(_joined(bricks), _joined(slots))
-    light = _joined(fluence), _joined(directions) if directional else None
-    dr.make_opaque(tables, index, light)
-    found = UnscatteredLight(index, *light, tables, forward(media))
-    if paths:
-        found = _with_paths(scene, media, seed, found, cells, paths)
-    dr.sync_thread()  # callers time this
-    return found
+    dr.make_opaque(tables, index)
+    return index, tables
 
 
 def _with_paths(
@@ -177,15 +196,20 @@ def _with_paths(
     # ---- the fit of each: L_s, then L_u, which has not scattered
     parts, first = [], 0
     for grid in (*cells, *cells):
-        part = dr.gather(mi.Float, D, first + dr.arange(mi.UInt32, n * grid.slots))
+        part = _part(D, first, n * grid.slots)
         first += n * grid.slots
-        dr.eval(part)
         grid.share(part, n, moments=True)
         grid.fit(part)
         parts.append(part)
     scattered, others = _joined(parts[: len(cells)]), light.fluence + _joined(parts[len(cells) :])
     dr.make_opaque(scattered, others)
     return replace(light, fluence=others, scattered=scattered)
+
+
+def _part(values: mi.Float, first: int, number: int) -> mi.Float:
+    result = dr.gather(mi.Float, values, first + dr.arange(mi.UInt32, number))
+    dr.eval(result)
+    return result
 
 
 def _joined(parts: list) -> Any:
@@ -307,6 +331,7 @@ def forward(media: WalkMedia) -> bool:
 class _Ray:
     """Loop variables of a ray of light inside an object."""
 
+    object: mi.Int32
     o: mi.Point3f
     d: mi.Vector3f
     off: mi.Vector3f  # from o to where the ray is clear of the surface
@@ -322,12 +347,11 @@ class _Ray:
 
 @dataclass(frozen=True, eq=False)
 class _Rays:
-    """Rays that bring the light of emitters to the cells of one object.
+    """Rays that bring the light of emitters to the cells of objects.
 
     Args:
         scene, media: of Mitsuba, and its objects.
-        k: number of the object.
-        grid: its cells.
+        index, tables: of the cells of all objects, as of `UnscatteredLight`.
         D: ∫ L_0 x_j dx dw over the inside of each cell by channel, x about its centre in units of h.
         w: by channel ∫ L_0 w dw dx, w the direction to the light, and likewise w_x², w_y², w_x w_y, w_x w_z, w_y w_z;
             None where directions do not count.
@@ -336,27 +360,33 @@ class _Rays:
 
     scene: mi.Scene
     media: WalkMedia
-    k: mi.Int32
-    grid: InsideCells
+    index: CellIndex
+    tables: dict[str, Any]
     D: mi.Float
     w: mi.Float | None
     forward: bool
 
+    def trace(self, k: int, rays: int, seed: int) -> None:
+        """Add the light of so many rays that enter object k."""
+        start = self.enter(k, rays, seed)
+        dr.while_loop((start,), lambda ray: ray.alive, lambda ray: (self.segment(ray),), label="rays of light")
+        dr.eval(self.D, self.w)
+
     def enter(self, number: int, rays: int, seed: int) -> _Ray:
-        """Rays of emitters at points of the surface, refracted into the object."""
-        media, rng = self.media, generator(mi, rays, pass_seed(seed, number))
+        """Rays of emitters at points of the surface of an object, refracted into it."""
+        media, rng, k = self.media, generator(mi, rays, pass_seed(seed, number)), dr.opaque(mi.Int32, number, rays)
         si, flux = lit_points(self.scene, media, number, rays, (seed, number), rng)
-        bs, value = sample_bsdf(media.boundary(self.k), si, rng, _only(mi.BSDFFlags.Transmission))
+        bs, value = sample_bsdf(media.boundary(k), si, rng, _only(mi.BSDFFlags.Transmission))
         d, _ = sided(si, bs.wo)
-        enters = (bs.pdf > 0) & (dr.dot(d, si.n) < 0) & ~media.enclosed(self.k)
+        enters = (bs.pdf > 0) & (dr.dot(d, si.n) < 0) & ~media.enclosed(k)
         flux = dr.select(enters, flux * value * bend(si, bs.wo, d), 0)
         enters &= dr.max(flux) > 0
         T = dr.full(mi.Spectrum, 1, rays)
         channel = dr.minimum(mi.UInt32(rng.next_float32() * len(T)), len(T) - 1)
         return _Ray(
-            o=mi.Point3f(si.p), d=d, off=media.clear(self.k, si.n, d), flux=mi.Spectrum(flux), T=T,
+            object=k, o=mi.Point3f(si.p), d=d, off=media.clear(k, si.n, d), flux=mi.Spectrum(flux), T=T,
             entered=dr.max(flux), channel=channel, density=mi.Spectrum(T), alive=mi.Bool(enters), rng=rng,
-            within=media.inner.priorities.start(mi.UInt32(self.k)) if media.overlaps else (),
+            within=media.inner.priorities.start(mi.UInt32(k)) if media.overlaps else (),
         )  # fmt: skip
 
     def segment(self, ray: _Ray) -> _Ray:
@@ -380,10 +410,11 @@ class _Rays:
 
         # ---- what is met: behind boundaries that a higher priority hides the ray goes on, and behind its own if
         # rounding has put it outside; a shape in the object ends it
-        met, within = media.met(si, self.k) == self.k, ray.within
-        boundary = media.boundary(self.k)
-        ends = mi.Bool(False) if media.inner is None else media.inner.around(si) == self.k
-        si = media.seen(si, media.index_of(si) if media.overlaps else self.k, d)
+        k, found, within = ray.object, media.met(si, ray.object), ray.within
+        met = found == k
+        boundary = media.boundary(k)
+        ends = mi.Bool(False) if media.inner is None else media.inner.around(si) == k
+        si = media.seen(si, found if media.overlaps or media.nested else k, d)
         own = met & (dr.dot(si.n, d) > 0)
         if media.overlaps:
             of = media.inner.priorities.meet(si, d, within)
@@ -399,17 +430,42 @@ class _Rays:
         reflected = (dr.dot(si.n, new) < 0) & (rng.next_float32() < survive)
         d = mi.Vector3f(dr.select(own, new, d))
         flux = dr.select(own, ray.flux * value / dr.maximum(survive, 1e-20), ray.flux)
-        return replace(
-            ray, o=mi.Point3f(si.p), d=d, off=media.clear(self.k, si.n, d), flux=flux, T=T,
+        at_boundary = replace(
+            ray, o=mi.Point3f(si.p), d=d, off=media.clear(k, si.n, d), flux=flux, T=T,
             alive=alive & ~ends & (~own | reflected), within=within,
         )  # fmt: skip
+        return _either(*self._between(ray, si, found, T), at_boundary) if media.nested else at_boundary
+
+    def _between(self, ray: _Ray, si: mi.SurfaceInteraction3f, found: mi.Int32, T: mi.Spectrum) -> tuple[mi.Bool, _Ray]:
+        """Whether a ray meets a boundary between an object and one in it, and the ray reflected or refracted there."""
+        # ---- into the object found, or out of it
+        media, k, d = self.media, ray.object, ray.d
+        around, inwards = media.inner.around(si), dr.dot(si.n, d) < 0
+        into, out = (found != k) & (around == k) & inwards, (found == k) & (around >= 0) & ~inwards
+        meets = (found >= 0) & (into | out)
+
+        # ---- flux *= f cos / p, and what light has beyond the camera's paths
+        ctx = mi.BSDFContext(mi.TransportMode.Importance)
+        bs, value = sample_bsdf(media.boundary_pointer(dr.maximum(found, 0)), si, ray.rng, ctx)
+        new, _ = sided(si, bs.wo)
+        through = dr.dot(new, si.n) * dr.dot(d, si.n) > 0
+        flux = ray.flux * value * dr.select(through, adjoint(si, d, new), 1)
+
+        # ---- the way on, with roulette
+        left = dr.max(dr.abs(flux * T)) / dr.maximum(ray.entered, 1e-30)
+        survive = dr.minimum(left / ROULETTE, MOST_SURVIVAL)
+        alive = ray.alive & si.is_valid() & (bs.pdf > 0) & (ray.rng.next_float32() < survive)
+        to = dr.select(through, dr.select(into, found, around), k)
+        o, off = media.depart(si, new, mi.Bool(True))
+        flux /= dr.maximum(survive, 1e-20)
+        return meets, replace(ray, object=to, o=o, d=new, off=off, flux=flux, T=T, alive=alive)
 
     def _fly(self, ray: _Ray, si: mi.SurfaceInteraction3f, far: mi.Float, alive: mi.Bool) -> _Ray:
         """A flight to a forward event, or to the surface and its reflection there."""
         media, rng = self.media, ray.rng
 
         # ---- flux T / p at the surface, flux sigma_s T / p at an event, p the mean over channels
-        m = media.coefficients(self.k, ray.o)
+        m = media.coefficients(ray.object, ray.o)
         t = free_path(m, ray.channel, rng.next_float32())
         if media.varies:
             t, flux, density, scatters, rng = self._collide(ray, t, far, alive)
@@ -428,12 +484,10 @@ class _Rays:
         survive = dr.minimum(dr.max(dr.abs(flux)) / dr.maximum(ray.entered * ROULETTE, 1e-30), 1)
         alive = alive & scatters & (rng.next_float32() < survive)
         at_event = replace(
-            ray, o=mi.Point3f(ray.o + ray.d * t), d=d, off=media.behind(self.k, d),
+            ray, o=mi.Point3f(ray.o + ray.d * t), d=d, off=media.behind(ray.object, d),
             flux=flux / dr.maximum(survive, 1e-20), density=density, alive=alive,
         )  # fmt: skip
-        a, b = vars(at_event), vars(at_surface)
-        state = {key: dr.select(scatters, a[key], b[key]) for key in a if key != "rng"}
-        return _Ray(**state, rng=rng)
+        return _either(scatters, at_event, at_surface)
 
     def _collide(self, ray: _Ray, t: mi.Float, far: mi.Float, alive: mi.Bool) -> tuple:
         """The distance of the first collision that is not null, where a medium varies, the flux and density there or at
@@ -445,7 +499,7 @@ class _Rays:
             rng: mi.PCG32,
         ) -> tuple:  # fmt: skip
             # the flight from the last collision at `start`
-            m = self.media.coefficients(self.k, ray.o + ray.d * t)
+            m = self.media.coefficients(ray.object, ray.o + ray.d * t)
             flight = fly(m, flux, density, channel, t - start, far - start, rng.next_float32())
             later = t + free_path(m, channel, rng.next_float32())
             return t, dr.select(flight.null, later, t), flight.weight, flight.density, flight.scatters, flight.null, rng
@@ -456,10 +510,12 @@ class _Rays:
 
     def _add(self, ray: _Ray, far: mi.Float, active: mi.Bool) -> None:
         """Add light to the cells at points of a segment, drawn by mean_c sigma_c T_c / (1 - T_c(far))."""
-        grid, n, points = self.grid, len(mi.Spectrum(0)), FORWARD_ALONG if self.forward else ALONG
-        sigma_t = self.media.spectrum("sigma_t", self.k)
-        low, scale = mi.Point3f(*(opaque(v) for v in grid.low)), opaque(1 / grid.h)
-        counts = mi.Vector3i(*(dr.opaque(mi.Int32, int(v)) for v in grid.counts))
+        n, points = len(mi.Spectrum(0)), FORWARD_ALONG if self.forward else ALONG
+        sigma_t = self.media.spectrum("sigma_t", ray.object)
+        if self.forward and self.media.nested:
+            even = dr.max(dr.abs(self.media.spectrum("g", ray.object))) == 0
+            points = dr.select(even, mi.UInt32(ALONG), points)
+        at = dr.gather(dict, self.tables, self.media.place_of(ray.object))
         ends = 1 - dr.exp(-sigma_t * far)
         a, b, c_ = -ray.d
         angles = mi.Vector4f(a, b, c_, a * a), mi.Vector4f(b * b, a * b, a * c_, b * c_)
@@ -474,8 +530,8 @@ class _Rays:
             light = ray.flux * ray.T * self._transmittance(ray, s, rng) / dr.maximum(pdf * points, 1e-20)
 
             # ---- its cell, and its place there
-            x = mi.Point3f((ray.o + ray.d * s - low) * scale)
-            slot, y, _, held = grid.index.find(x, mi.Int32(0), counts, active & (far > 0))
+            x = mi.Point3f((ray.o + ray.d * s - at["low"]) * at["scale"])
+            slot, y, _, held = self.index.find(x, at["first"], at["counts"], active & (far > 0))
 
             # ---- light x_j by channel, and light by directions
             for c in range(n):
@@ -489,7 +545,7 @@ class _Rays:
 
     def _transmittance(self, ray: _Ray, s: mi.Float, rng: mi.PCG32 | None = None) -> mi.Spectrum:
         """exp(-∫ sigma_t) over a distance along a ray."""
-        return self.media.transmittance(self.k, mi.Ray3f(ray.o, ray.d), s, rng or ray.rng)
+        return self.media.transmittance(ray.object, mi.Ray3f(ray.o, ray.d), s, rng or ray.rng)
 
 
 def _only(flags: int) -> mi.BSDFContext:
@@ -499,15 +555,7 @@ def _only(flags: int) -> mi.BSDFContext:
     return ctx
 
 
-def _moments(
-    scene: mi.Scene, media: WalkMedia, k: int, grid: InsideCells, seed: int, rays: int, directional: bool
-) -> tuple[mi.Float, mi.Float | None]:
-    """D of the cells of object k, (slots, channels, 4) in a row, and their w, (slots, channels, 8) if `directional`."""
-    n = len(mi.Spectrum(0))
-    D = dr.zeros(mi.Float, grid.slots * n * 4)
-    w = dr.zeros(mi.Float, grid.slots * n * 8) if directional else None
-    traced = _Rays(scene, media, dr.opaque(mi.Int32, k, rays), grid, D, w, forward(media))
-    start = traced.enter(k, rays, seed)
-    dr.while_loop((start,), lambda ray: ray.alive, lambda ray: (traced.segment(ray),), label="rays of light")
-    dr.eval(D, w)
-    return D, w
+def _either(first: mi.Bool, a: _Ray, b: _Ray) -> _Ray:
+    """One of two rays, which have the random numbers of the second."""
+    state = {key: dr.select(first, value, getattr(b, key)) for key, value in vars(a).items() if key != "rng"}
+    return _Ray(**state, rng=b.rng)

@@ -512,6 +512,13 @@ class WalkMedia:
         """Whether object k lies inside another and overlaps nothing: light comes to it by way of that alone."""
         return (k < 0) if self.inner is None else dr.gather(mi.Bool, self.inner.tables["enclosed"], k)
 
+    @cached_property
+    def nested(self) -> bool:
+        """Whether an object lies inside another, and nothing overlaps: light comes to it by way of that."""
+        if self.inner is None or self.overlaps:
+            return False
+        return bool(np.array(self.inner.tables["enclosed"]).any())
+
     @property
     def outermost(self) -> list[Geometry]:
         """The objects, and the glass about them."""

@@ -205,6 +205,12 @@ class Crossing:
         inwards = (dr.dot(self.along, self.si.n) > 0) & (dr.dot(d, self.si.n) < 0)
         return inwards & (media.index_of(self.si) >= 0)
 
+    def brings(self, media: WalkMedia, d: mi.Vector3f) -> mi.Bool:
+        """Whether unscattered light that is precomputed comes by it to a walk inside that goes on along d."""
+        if not media.nested:
+            return self.reflected(media, d)
+        return ~self.leaves & (media.index_of(self.si) >= 0)
+
 
 class Visitor(Protocol):
     """What is recorded of a walk. Each method returns the walk, whose random numbers it may use up, and its record: as

@@ -264,10 +264,11 @@ def test_a_lamp_that_looks_small_from_a_part_of_a_ball_has_the_same_mean_by_samp
 
 
 @pytest.mark.slow
-def test_precomputed_light_around_what_lies_inside_has_the_mean_of_sampled_light() -> None:
+@pytest.mark.parametrize("g", [0.0, 0.5])
+def test_precomputed_light_around_and_in_what_lies_inside_has_the_mean_of_sampled_light(g: float) -> None:
     held = {"medium": _held("medium", -1.8, 1.5), "bubble": _held("bubble", 1.8, 1.5)}
     stone = {**_ball(1.2, center=[0, -2.5, 3]), "bsdf": {"type": "diffuse", "reflectance": 0.7}}
-    _compare(MEDIUM, 0.02, spp=1024, stone=stone, lamp=_lamp(), **held)
+    _compare({**MEDIUM, "g": g}, 0.02, spp=320, stone=stone, lamp=_lamp(20.0), **held)
 
 
 @pytest.mark.slow
