@@ -31,7 +31,7 @@ from full_geometry.integrators.lit_entries import LitEntries
 from full_geometry.integrators.surface_paths import replay_paths, trace_paths
 from full_geometry.objects.inclusions import check_sensors
 from full_geometry.objects.objects import KnowsUnit, TranslucentObject
-from full_geometry.objects.small_emitters import check_emitters
+from full_geometry.objects.small_emitters import check_emitters, check_sampled
 from full_geometry.settings import GATHERED_LIGHTS, Choices, Settings, read_settings
 from full_geometry.surface.translucent import is_translucent
 from full_geometry.surface.wrapped import wraps
@@ -97,6 +97,8 @@ def _class(variant: str) -> type:
             objects = self.corrections.without_model(scene, settings) if light == "corrected" else None
             if objects is None:
                 objects, light = self._objects.of(scene), self._objects.choices.light
+                if light != "corrected":
+                    check_sampled(scene)
                 if light in GATHERED_LIGHTS:
                     objects = self.gathering.of(scene, objects, settings)
             return objects, self.corrections.of(scene, objects, settings, samples) if light == "corrected" else None

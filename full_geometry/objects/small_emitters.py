@@ -272,6 +272,16 @@ def check_emitters(scene: mi.Scene) -> None:
             warnings.warn(message, stacklevel=2)
 
 
+def check_sampled(scene: mi.Scene) -> None:
+    """ValueError if an emitter is never sampled: orders 0 and 1 beside models have its light by that alone."""
+    for emitter in scene.emitters():
+        if not emitter.sampling_weight() > 0:
+            raise ValueError(
+                f"sampling_weight must be > 0 for bssrdf, got {emitter.sampling_weight():g} of emitter "
+                f"{emitter.id()!r}: translucent_walk and corrected light take it"
+            )
+
+
 def _check_finite(emitter: mi.Emitter) -> None:
     parameters = mi.traverse(emitter)
     for key in parameters.keys():

@@ -278,6 +278,15 @@ def test_emitters_that_path_tracers_cannot_find_are_named(integrator: str) -> No
         assert np.array(mi.render(scene, spp=1)).max() == 0
 
 
+@pytest.mark.parametrize("light", ["sampled", "gathered"])
+def test_models_refuse_emitters_that_are_never_sampled(light: str) -> None:
+    lamp = {"type": "rectangle", "to_world": _looking(PLACE), "emitter": {"type": "area", "sampling_weight": 0.0}}
+    lights = {"lamp": lamp, "sky": {"type": "constant"}}
+    scene = mi.load_dict(_scene({"type": "bssrdf", "light": light}, lights, model="better_dipole"))
+    with pytest.raises(ValueError, match="sampling_weight must be > 0 for bssrdf, got 0 of emitter"):
+        mi.render(scene, spp=1)
+
+
 @pytest.mark.parametrize("turned", [0.0, 180.0], ids=["copies", "back to back"])
 @pytest.mark.parametrize("integrator", ["translucent_walk", "bssrdf"])
 def test_lamps_on_each_other_are_refused_by_name(integrator: str, turned: float) -> None:
