@@ -172,7 +172,8 @@ def _image(
         denoise = Denoiser(way.scene, which["sensor"]) if way.denoise else None
         result = _rendered(way.scene, file, way.limits, {**which, "denoise": denoise}, images.resume)
         clean = cross_denoised(result, denoise) if denoise else None
-        relative, error = result.relative_error, _error(result, way.limits.target_error or SMALL_ERROR)
+        relative = math.hypot(result.relative_error, result.light_error)
+        error = _error(result, way.limits.target_error or SMALL_ERROR)
         told = {"samples": str(result.spp), "time, s": f"{result.seconds:.3g}"}
         told["relative error"] = f"{relative:.2%}" if 0 < relative < math.inf else "–"
         off = (clean.image, {"error": clean.told}) if clean else None

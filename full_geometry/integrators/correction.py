@@ -22,6 +22,7 @@ thin, and C beyond its second degree in w_o, or the third of its cosine.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -77,7 +78,8 @@ class SurfaceCorrection:
         halves: sums of independent residuals, of all channels together, or of each where textures part their factors.
         launches: of walks that they are of.
         values: C at the points times `scale_of` the light, (points, channels, terms).
-        error: RMS of the light over its mean, as far as `surface_regression` tells it.
+        lost: mean squared error of the light over points, as far as `surface_regression` tells it.
+        whole: mean square of the light.
     """
 
     gathered: Gathered
@@ -85,7 +87,18 @@ class SurfaceCorrection:
     halves: tuple[list[ResidualSums], list[ResidualSums]]
     launches: int
     values: np.ndarray
-    error: float
+    lost: float
+    whole: float
+
+    @property
+    def error(self) -> float:
+        """sqrt(sum e² / sum L²) over points."""
+        return math.sqrt(self.lost / self.whole) if self.whole > 0 else 0.0
+
+    @property
+    def finest(self) -> bool:
+        """Whether no image has more walks."""
+        return self.launches >= MOST // PER_LAUNCH
 
     @property
     def walks(self) -> int:
@@ -99,18 +112,19 @@ class SurfaceCorrection:
         """The regression of residuals."""
         points = gathered.points
         p, n = (np.array(v, dtype=float).T for v in (points.p, points.n))
-        B = np.array(gathered.values, dtype=float).reshape(len(points), -1, gathered.terms)
+        B = np.array(gathered.values, dtype=float).reshape(len(points), -1, gathered.terms)[:, :, 0]
         found = levels(p, n, area, _number(halves))
-        C, squared, whole = [], 0.0, 0.0
-        for parts, known in zip(zip(*halves), np.array_split(B[:, :, 0], len(halves[0]), axis=1)):
+        C, lost, whole = [], 0.0, 0.0
+        for parts, c in zip(zip(*halves), _channels_together(gathered)):
+            known = B[:, c]
             G = known.mean(axis=1)
             G = (G - G.mean()) / max(float(G.std()), 1e-12 + 1e-3 * float(np.abs(G).mean()))
-            field, lost = smooth_field(found, p, G, parts)
+            field, mean, e2 = smooth_field(found, p, G, parts)
             C.append(field)
-            # RMS over points, over the mean of all light that leaves
-            squared, whole = squared + lost.mean(), whole + np.square((parts[0] + parts[1]).mean).sum()
-        error = float(np.sqrt(squared / whole)) if whole > 0 else 0.0
-        return cls(gathered, area, halves, launches, np.concatenate(C, axis=1), error)
+            # what is found has the square of its error beside that of the light
+            light2 = np.square(scale_of(gathered)[c] * known + mean).sum(axis=1)
+            lost, whole = lost + e2.mean(), whole + max(light2.mean() - e2.mean(), 0.0)
+        return cls(gathered, area, halves, launches, np.concatenate(C, axis=1), float(lost), float(whole))
 
     @property
     def corrected(self) -> Gathered:
@@ -124,7 +138,8 @@ class SurfaceCorrection:
     def told(self) -> str:
         """How many walks, and the error."""
         name = self.gathered.object.geometry.name
-        return f"light of object {name} corrected by {self.walks} walks: about {self.error:.1%} off at a point"
+        most = ", the most that images have" if self.finest else ""
+        return f"light of object {name} corrected by {self.walks} walks{most}: about {self.error:.1%} off at a point"
 
 
 class Corrections:
@@ -236,6 +251,23 @@ class Corrections:
 
     def _launches(self, k: int) -> int:
         return self._known[k].launches if self._known[k] else 0
+
+    @property
+    def error(self) -> float | None:
+        """sqrt(sum e² / sum L²) over the surfaces of all objects; None before light is known."""
+        known = [each for each in self._known if each is not None]
+        lost, whole = (sum(each.area * getattr(each, name) for each in known) for name in ("lost", "whole"))
+        return (math.sqrt(lost / whole) if whole > 0 else 0.0) if known else None
+
+    @property
+    def samples(self) -> int:
+        """Samples of an image that has so many walks."""
+        return SAMPLES_PER_WALK * PER_LAUNCH * max((each.launches for each in self._known if each), default=0)
+
+    @property
+    def finest(self) -> bool:
+        """Whether no image has more walks."""
+        return all(each is None or each.finest for each in self._known)
 
     def told(self) -> list[str]:
         """A line for each object: walks, and error."""
@@ -350,8 +382,8 @@ def residuals(tracer: PathTracer, k: int, gathered: Gathered, seed: int) -> list
     bent_w = bent(out.w, out.n_out, gathered.albedo.eta)
     mu = dr.dot(bent_w, out.n_out)
     lanes = dr.zeros(mi.Float, PER_LAUNCH)
-    a, r, W, R = (mi.Spectrum(v) + lanes for v in (a, r, W, R))
-    dr.eval(a, r, W, R, point, near, bent_w, mu)
+    a, r, R = (mi.Spectrum(v) + lanes for v in (a, r, R))
+    dr.eval(a, r, R, point, near, bent_w, mu)
 
     if not dr.all(dr.isfinite(dr.sum(r)))[0]:
         raise ValueError(
@@ -360,7 +392,7 @@ def residuals(tracer: PathTracer, k: int, gathered: Gathered, seed: int) -> list
 
     # ---- sums over the residuals of each point, of channels that send any light back there
     kept = np.array(near)
-    a, r, W, R, bent_w = (np.array(v, dtype=float)[:, kept].T for v in (a, r, W, R, bent_w))
+    a, r, R, bent_w = (np.array(v, dtype=float)[:, kept].T for v in (a, r, R, bent_w))
     a = a / scale_of(gathered)
     r = _steadied(r, a)
     Y = np.stack(directional(*bent_w.T, np.array(mu, dtype=float)[kept]), axis=1)
@@ -368,7 +400,7 @@ def residuals(tracer: PathTracer, k: int, gathered: Gathered, seed: int) -> list
     for c in _channels_together(gathered):
         some = a[:, c].min(axis=1) > LEAST_ALBEDO
         terms = Y if gathered.object.textured is None else np.column_stack([Y, *painted(R[:, c])])
-        values = (v[some] for v in (terms, a[:, c], r[:, c], W[:, c]))
+        values = (v[some] for v in (terms, a[:, c], r[:, c]))
         found.append(ResidualSums.of(point[some], *values, len(gathered.points)))
     return found
 

@@ -60,41 +60,30 @@ def painted(R: Any) -> list[Any]:
 class ResidualSums:
     """Sums over the residuals of each point.
     `number`: of residuals, (points,). `a`: Σ a Y Y^T, (points, terms, terms). `r`: Σ a Y r / a, (points, terms,
-    channels). `light`: Σ of the light that residuals are a part of, (channels,)."""
+    channels)."""
 
     number: np.ndarray
     a: np.ndarray
     r: np.ndarray
-    light: np.ndarray
 
     @classmethod
     def zeros(cls, points: int, channels: int, terms: int) -> ResidualSums:
         """Sums of no residuals."""
-        return cls(np.zeros(points), np.zeros((points, terms, terms)), np.zeros((points, terms, channels)),
-                   np.zeros(channels))  # fmt: skip
+        return cls(np.zeros(points), np.zeros((points, terms, terms)), np.zeros((points, terms, channels)))
 
     @classmethod
-    def of(
-        cls, point: np.ndarray, Y: np.ndarray, a: np.ndarray, r: np.ndarray, light: np.ndarray, points: int
-    ) -> ResidualSums:  # fmt: skip
-        """Sums of residuals r (n, channels) of light (n, channels) in directions of Y (n, terms) at points.
-        Their factors a (n, channels) are above 0."""
+    def of(cls, point: np.ndarray, Y: np.ndarray, a: np.ndarray, r: np.ndarray, points: int) -> ResidualSums:
+        """Sums of residuals r (n, channels) in directions of Y (n, terms) at points; factors a (n, channels) > 0."""
         # a is the mean over the channels, so that all have the same weights
         weight, (n, terms) = a.mean(axis=1), Y.shape
         outer = (weight[:, None, None] * Y[:, :, None] * Y[:, None, :]).reshape(n, terms * terms)
         right = ((weight[:, None] * r / a)[:, None, :] * Y[:, :, None]).reshape(n, terms * r.shape[1])
         at = csr_array((np.ones(n), (point, np.arange(n))), shape=(points, n))
         number = np.bincount(point, minlength=points).astype(float)
-        return cls(number, (at @ outer).reshape(points, terms, terms), (at @ right).reshape(points, terms, -1),
-                   light.sum(axis=0))  # fmt: skip
+        return cls(number, (at @ outer).reshape(points, terms, terms), (at @ right).reshape(points, terms, -1))
 
     def __add__(self, other: ResidualSums) -> ResidualSums:
-        return ResidualSums(*(getattr(self, name) + getattr(other, name) for name in ("number", "a", "r", "light")))
-
-    @property
-    def mean(self) -> np.ndarray:
-        """Σ light / Σ a, (channels,)."""
-        return self.light / max(float(self.a[:, 0, 0].sum()), 1e-30)
+        return ResidualSums(*(getattr(self, name) + getattr(other, name) for name in ("number", "a", "r")))
 
 
 def size_of(p: np.ndarray) -> float:
@@ -222,8 +211,9 @@ def _zonal(G: np.ndarray, sums: ResidualSums) -> np.ndarray:
 
 def smooth_field(
     of: list[Level], p: np.ndarray, G: np.ndarray, halves: tuple[ResidualSums, ResidualSums]
-) -> tuple[np.ndarray, np.ndarray]:
-    """C (points, channels, terms), and its mean squared error (points,), the sum over channels.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """C (points, channels, terms), its mean over directions (points, channels), 0 where no residuals are, and its mean
+    squared error (points,), the sum over channels.
     `of`: levels. `p`: positions (points, 3). `G`: a feature (points,), of the order of one. `halves`: independent
     residuals."""
     # ---- one fit of all points by the cosine, then what each level adds, filtered
@@ -242,6 +232,6 @@ def smooth_field(
         C = [C_half + more for C_half, more in zip(C, d)]
 
     # ---- squared error: what the filter loses, finer detail, and the noise of the mean of both halves
-    apart = C[0] - C[1]
+    apart, result = C[0] - C[1], 0.5 * (C[0] + C[1])
     error = lost + 0.25 * np.maximum(sum(directions.powers(apart, apart)), 0)
-    return np.moveaxis(0.5 * (C[0] + C[1]), 1, 2), error
+    return np.moveaxis(result, 1, 2), directions.mean(result), error

@@ -44,7 +44,16 @@ from full_geometry.geometry.sensors import sampled_size, seeded
 from full_geometry.geometry.snapshot import children, scene_hash, words
 from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.objects.objects import translucent_shapes
-from full_geometry.scenes.reference_store import BY_CHANCE, CHANNELS, DENOISED, Reference, finite_pixels, load, save
+from full_geometry.scenes.reference_store import (
+    BY_CHANCE,
+    CHANNELS,
+    DENOISED,
+    LIGHT,
+    Reference,
+    finite_pixels,
+    load,
+    save,
+)
 from full_geometry.scenes.scene_files import first_cause
 from full_geometry.settings import AUTO, check_variant
 from full_geometry.surface.wrapped import surface_of
@@ -209,7 +218,7 @@ def _in_passes(
     try:
         while not limits.reached(result):
             start = result or Reference.empty((), about, denoise is not None)
-            result = _pass(start, scene, integrator, limits.next_spp(result))
+            result = _pass(start, scene, integrator, limits)
             if denoise is not None and limits.target_error is not None:
                 result = _with_error(result, denoise)
             if time.monotonic() - last >= limits.interval:
@@ -249,7 +258,8 @@ class Limits:
     Args:
         spp: samples per pixel in all.
         passes: number of passes in all.
-        target_error: `Reference.error` to come down to; looked at from the 8th pass on.
+        target_error: `Reference.error` to come down to; looked at from the 8th pass on. Where corrected light
+            has all its walks, it is enough that noise is below it and below the error of light.
         seconds: of rendering in all.
         spp_per_pass: samples per pixel of a pass; by default passes grow with what is there, from 1 to 64. The last
             one is cut to `spp`.
@@ -288,8 +298,14 @@ class Limits:
             return False
         trusted = reference.passes >= FEWEST_PASSES
         pairs = ((self.spp, reference.spp), (self.passes, reference.passes), (self.seconds, reference.seconds))
-        certain = self.target_error is not None and trusted and reference.error <= self.target_error
+        certain = self.target_error is not None and trusted and self._certain(reference)
         return certain or any(limit is not None and value >= limit for limit, value in pairs)
+
+    def _certain(self, reference: Reference) -> bool:
+        light = reference.about.get(LIGHT, {"finest": False})
+        # light that has all its walks gets no better
+        enough = light["finest"] and reference.noise <= min(light["now"], self.target_error)
+        return enough or reference.error <= self.target_error
 
     def share(self, reference: Reference) -> float:
         """The share of the work that is done, 0 to 1."""
@@ -301,13 +317,13 @@ class Limits:
         return min(max(shares, default=0.0), 1.0)
 
 
-def _pass(start: Reference, scene: mi.Scene, integrator: mi.Integrator, spp: int) -> Reference:
-    about, number = start.about, start.passes
+def _pass(start: Reference, scene: mi.Scene, integrator: mi.Integrator, limits: Limits) -> Reference:
+    about, number, spp = start.about, start.passes, limits.next_spp(start if start.passes else None)
     started, sensor, seed = time.perf_counter(), about["sensor"], seeded(about["seed"], number)
-    # corrected light, as asked for or as chosen, has its walks by all samples so far, twice as many now and then
-    if is_bssrdf(integrator) and (integrator.settings.light == "corrected" or integrator.corrections.told()):
-        samples = (start.spp + spp) * int(np.prod(sampled_size(scene.sensors()[sensor].film())))
-        integrator.prepare(scene, 2 ** (samples.bit_length() - 1))
+    corrected = is_bssrdf(integrator) and (integrator.settings.light == "corrected" or integrator.corrections.told())
+    samples = (start.spp + spp) * int(np.prod(sampled_size(scene.sensors()[sensor].film())))
+    if corrected:
+        integrator.prepare(scene, _samples_of_light(start, samples, limits))
     image = mi.render(scene, sensor=sensor, integrator=integrator, seed=seed, spp=spp)
     image = finite_pixels(f"pass {number}", image)
     if not number:
@@ -315,10 +331,27 @@ def _pass(start: Reference, scene: mi.Scene, integrator: mi.Integrator, spp: int
         about = {**about, CHANNELS: names} if names else about
         start = Reference.empty(image.shape, about, start.half is not None)
     result = start.add(image, spp, time.perf_counter() - started)
-    if not is_bssrdf(integrator) or mi.is_spectral:
+    if not is_bssrdf(integrator):
+        return result
+    if corrected:
+        made = integrator.corrections
+        error = (start.light_error * start.spp + made.error * spp) / result.spp
+        light = {"error": float(f"{error:.6g}"), "now": float(f"{made.error:.6g}")}
+        light |= {"samples": made.samples, "finest": made.finest}
+        result = replace(result, about={**result.about, LIGHT: light})
+    if mi.is_spectral:
         return result
     squares = float(f"{start.about.get(BY_CHANCE, 0.0) + integrator.unconnected:.6g}")
     return replace(result, about={**result.about, BY_CHANCE: squares})
+
+
+def _samples_of_light(start: Reference, samples: int, limits: Limits) -> int:
+    """Samples whose walks corrected light has in a pass: all so far, to a power of two, or twice those of the pass
+    before while light takes more than half of the square of an asked error."""
+    result, light = 2 ** (samples.bit_length() - 1), start.about.get(LIGHT)
+    if limits.target_error is not None and light and light["now"] > math.sqrt(0.5) * limits.target_error:
+        result = max(result, 2 * light["samples"])
+    return result
 
 
 def channel_names(film: mi.Film, integrator: mi.Integrator, channels: int) -> list[str]:

@@ -26,6 +26,7 @@ FORMAT = "halfspace-sss reference 3"
 HEADER = "halfspace_sss"
 CHANNELS = "channels"  # their names
 DENOISED = "denoised"  # error of the denoised image, its standard error, and the samples that it is of
+LIGHT = "light"  # error of corrected light, the mean over samples and now; samples that have its walks; if it has all
 BY_CHANCE = "squares_by_chance"  # of light that orders below two met by chance, summed over samples
 
 
@@ -77,13 +78,23 @@ class Reference:
         return float(np.sqrt(self.variance[..., :3][lit].sum() / np.sum(self.mean[..., :3][lit] ** 2)))
 
     @property
-    def error(self) -> float:
+    def noise(self) -> float:
         """`relative_error`, or with halves the most that the denoised image is off: its error and one standard error.
         Infinite before that is known."""
         if self.half is None:
             return self.relative_error
         known = self.about.get(DENOISED)
         return known["error"] + known["standard_error"] if known else math.inf
+
+    @property
+    def light_error(self) -> float:
+        """The relative error of corrected light, which passes share, so that their spread does not show it."""
+        return self.about.get(LIGHT, {}).get("error", 0.0)
+
+    @property
+    def error(self) -> float:
+        """What the image is off: its noise and `light_error`, as of an object that fills it."""
+        return math.hypot(self.noise, self.light_error)
 
     @property
     def share_by_chance(self) -> float | None:

@@ -55,8 +55,8 @@ def _regression(residuals: int, seed: int = 0) -> tuple[float, float, float]:
         a = np.repeat(0.5 + 0.5 * (w * p[point]).sum(axis=1, keepdims=True), 3, axis=1)
         Y = np.stack(directional(*w.T, 0.7 + 0.3 * (w * p[point]).sum(axis=1)), axis=1)
         r = a * (constant[point] + 0.1 * w[:, :1] + 0.2 * Y[:, -1:]) * rng.exponential(size=(residuals // 2, 1))
-        halves.append(ResidualSums.of(point, Y, a, r, r, len(p)))
-    C, squared = smooth_field(levels(p, p, 4 * np.pi, residuals), p, G, (halves[0], halves[1]))
+        halves.append(ResidualSums.of(point, Y, a, r, len(p)))
+    C, _, squared = smooth_field(levels(p, p, 4 * np.pi, residuals), p, G, (halves[0], halves[1]))
     a = halves[0].a + halves[1].a
     Y = a[:, 0] / a[:, :1, 0]
     wanted = constant + 0.1 * Y[:, 1:2] + 0.2 * Y[:, -1:]
@@ -87,8 +87,8 @@ def test_a_slope_over_the_cosine_is_found_on_a_rod_whose_normals_turn_within_the
         w /= np.linalg.norm(w, axis=1)[:, None]
         Y = np.stack(directional(*w.T, (w * n[point]).sum(axis=1)), axis=1)
         r = (1 + slope[point] * Y[:, 9:10]) * np.ones(3)
-        halves.append(ResidualSums.of(point, Y, np.ones_like(r), r, r, 1024))
-    C, _ = smooth_field(levels(p, n, 2 * np.pi * RADIUS, 2**17), p, 0 * k, (halves[0], halves[1]))
+        halves.append(ResidualSums.of(point, Y, np.ones_like(r), r, 1024))
+    C, _, _ = smooth_field(levels(p, n, 2 * np.pi * RADIUS, 2**17), p, 0 * k, (halves[0], halves[1]))
     along = np.stack(directional(*n.T, np.ones(1024)), axis=1)
     assert np.sqrt(np.square((C * along[:, None, :]).sum(axis=2) - 1 - slope).mean()) < 0.1
 
@@ -103,11 +103,9 @@ def test_places_and_directions_of_walks_are_even_in_each_pair_of_dimensions() ->
 def test_sums_of_two_sets_of_residuals_are_those_of_both() -> None:
     rng = np.random.default_rng(1)
     point, Y, a, r = rng.integers(0, 5, 60), rng.normal(size=(60, 4)), rng.random((60, 3)) + 0.1, rng.random((60, 3))
-    parts = [
-        ResidualSums.of(point[s], Y[s], a[s], r[s], r[s] + 1, 5) for s in (slice(0, 40), slice(40, 60), slice(0, 60))
-    ]
+    parts = [ResidualSums.of(point[s], Y[s], a[s], r[s], 5) for s in (slice(0, 40), slice(40, 60), slice(0, 60))]
     both, whole = parts[0] + parts[1], parts[2]
-    for x, y in ((both.number, whole.number), (both.a, whole.a), (both.r, whole.r), (both.mean, whole.mean)):
+    for x, y in ((both.number, whole.number), (both.a, whole.a), (both.r, whole.r)):
         np.testing.assert_allclose(x, y, rtol=1e-12)
 
 
@@ -247,6 +245,23 @@ def test_a_render_in_passes_has_walks_by_all_its_samples(scene: Any, few: None, 
     assert int(told.split("corrected by ")[1].split()[0]) > 1.5 * correction.FEWEST
 
 
+def test_a_render_to_an_error_has_walks_until_light_takes_at_most_half_of_its_square(
+    scene: Any, few: None, tmp_path: Path
+) -> None:
+    found = reference.render(scene, tmp_path / "image.exr", target_error=0.06)
+    assert found.error <= 0.06
+    assert 0 < scene.integrator().corrections.error <= 0.06 / 2**0.5
+    assert scene.integrator().corrections.samples > 144 * found.spp
+
+
+def test_a_render_to_an_error_below_that_of_most_walks_ends_when_its_noise_is_below(
+    scene: Any, few: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(correction, "MOST", correction.FEWEST)
+    found = reference.render(scene, tmp_path / "image.exr", target_error=0.05)
+    assert found.noise <= 0.05 < found.error
+
+
 def test_walks_that_are_added_have_seeds_of_their_own_however_many_were_lost(
     scene: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -255,7 +270,7 @@ def test_walks_that_are_added_have_seeds_of_their_own_however_many_were_lost(
     def nothing(*arguments: Any) -> list[ResidualSums]:
         seeds.append(arguments[-1])
         points, ones = len(arguments[2].points), np.ones((9, 3))
-        return [ResidualSums.of(np.zeros(9, int), np.ones((9, TERMS)), ones, ones, ones, points)]
+        return [ResidualSums.of(np.zeros(9, int), np.ones((9, TERMS)), ones, ones, points)]
 
     monkeypatch.setattr(correction, "residuals", nothing)
     for spp, launches in ((16, 2), (16, 2), (2**14, 4), (2**14, 4), (2**15, 8)):
