@@ -207,7 +207,10 @@ def _with_paths(
 
 
 def _part(values: mi.Float, first: int, number: int) -> mi.Float:
-    result = dr.gather(mi.Float, values, first + dr.arange(mi.UInt32, number))
+    """So many of the values from `first` on: no copy if they are all."""
+    if number == dr.width(values):
+        return values
+    result = dr.gather(mi.Float, values, dr.opaque(mi.UInt32, first) + dr.arange(mi.UInt32, number))
     dr.eval(result)
     return result
 
