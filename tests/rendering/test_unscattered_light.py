@@ -432,7 +432,7 @@ def test_the_layer_of_emission_holds_the_mirror_and_what_is_behind_the_object() 
     ("surface", "reason"),
     [
         ({**MEDIUM, "orders": "single"}, "orders of object 'object' are 'single'"),
-        ({**PAINTED, "g": 0.8}, r"abs\(g\) of object 'object' is above 0.5 in a scene with textures of media"),
+        ({**PAINTED, "g": 0.2}, r"abs\(g\) of object 'object' is above 0.1 in a scene with textures of media"),
         ({**MEDIUM, "sigma_s": 1e4}, "so many mean free paths wide"),
     ],
 )
