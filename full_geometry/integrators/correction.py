@@ -34,7 +34,7 @@ from full_geometry.geometry.points import cosine_above, floats, place, surface_p
 from full_geometry.geometry.rounding import ray_from
 from full_geometry.geometry.shape import is_inside
 from full_geometry.geometry.snapshot import same_objects
-from full_geometry.integrators.gathering import Gathered, OutgoingLight, light_state
+from full_geometry.integrators.gathering import Gathered, OutgoingLight, light_state, way_in_is_clear
 from full_geometry.integrators.inner_light import cut_to_next
 from full_geometry.integrators.walk_paths import PathTracer
 from full_geometry.objects.objects import TranslucentObject
@@ -378,7 +378,7 @@ def residuals(tracer: PathTracer, k: int, gathered: Gathered, seed: int) -> list
     W, _, _ = tracer.trace(ray, PATH_LANES, (seed,))
     a, R = gathered.factor(out, met), gathered.reflectance(out)
     r = W - gathered.radiance(out, met)
-    point, near = gathered.points.nearest(out.p, out.n, met)
+    point, near = gathered.points.nearest(out.p, out.n, way_in_is_clear(media, si, number, w, met))
     bent_w = bent(out.w, out.n_out, gathered.albedo.eta)
     mu = dr.dot(bent_w, out.n_out)
     lanes = dr.zeros(mi.Float, PER_LAUNCH)

@@ -13,6 +13,7 @@ detail of light below the distance of the points (`fine_light` keeps its flux). 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -56,6 +57,7 @@ FEWEST, MOST = 24, 1024  # of a point
 PART = 1 / 8  # of the samples of a transport matrix
 SPREADINGS = 4  # of what other surfaces send,
 BRIGHTEST = 1 / 128  # of the points, which share it no matter how bright
+FLIGHT = 0.05  # of flights go beyond where things inside are looked for
 TRACED = 8  # one of so many directions by the cosine is traced further, where it meets a surface
 
 
@@ -202,6 +204,7 @@ class OutgoingLight:
         """Whether light that leaves object k is known, and that along w from a point with normals outwards."""
         place = self.media.place_of(k)
         active = active & dr.gather(mi.Bool, self.known, place)
+        active = way_in_is_clear(self.media, si, k, w, active)
         out, a, R = surface_point(si.p, si.n, si.sh_frame.n, w), mi.Spectrum(0), mi.Spectrum(1)
         # a(w) and R of each object, with the medium that textures have here
         for kind in range(len(self.media.objects)):
@@ -211,6 +214,22 @@ class OutgoingLight:
                 a, R = dr.select(here, light.factor(at, here), a), dr.select(here, light.reflectance(at), R)
         B = _blended(self.points, self.values, self.terms, out, self.media.row("eta", k), active, R, place)
         return active, dr.select(active & (dr.dot(w, out.n_out) > 0), a * B, 0)
+
+
+def way_in_is_clear(
+    media: WalkMedia, si: mi.SurfaceInteraction3f, k: mi.Int32, w: mi.Vector3f, active: mi.Bool
+) -> mi.Bool:
+    """Whether the straight way in of what leaves object k along w meets nothing inside, as far as a flight gets.
+    Things inside have edges there, which no smooth function of directions follows."""
+    if media.inner is None:
+        return active
+    d = -bent(w, dr.select(dr.dot(si.n, w) > 0, si.n, -si.n), media.row("eta", k))
+    o, off = media.depart(si, d, mi.Bool(True))
+    ray = mi.Ray3f(o + off, d)
+    ray.maxt = -math.log(FLIGHT) / dr.min(media.spectrum("sigma_t", k))
+    hit = media.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+    met = media.instance_scene.interaction(hit, ray, media.needed)
+    return active & (~hit.is_valid() | (media.met(met, k) == k))
 
 
 class Gathering:
