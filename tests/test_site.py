@@ -80,6 +80,7 @@ def test_every_page_has_its_pictures_and_links_and_known_tags_only(site: Path) -
     assert pictures >= 5
 
 
+@pytest.mark.slow
 def test_every_page_says_the_version_and_so_does_the_citation(site: Path) -> None:
     said = f"halfspace-sss {halfspace_sss.__version__}, "
     assert [file for file in site.rglob("index.html") if said not in file.read_text(encoding="utf-8")] == []
@@ -97,6 +98,7 @@ def test_the_recipe_of_conda_asks_for_the_versions_of_the_package() -> None:
     assert (recipe["package"]["version"], recipe["about"]["license"]) == (project["version"], project["license"])
 
 
+@pytest.mark.slow
 def test_notebooks_install_the_library_and_hold_the_cells_of_their_scripts(site: Path) -> None:
     scripts = sorted((ROOT / "docs" / "notebooks").glob("*.py"))
     for script in scripts:

@@ -222,6 +222,7 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(correction, name, getattr(correction, name) // 8)
 
 
+@pytest.mark.slow
 def test_a_medium_that_is_black_in_two_channels_has_the_light_of_walks_in_the_other(few: None) -> None:
     red = {"sigma_t": 1.2, "albedo": "0.9,0,0", "eta": 1.4}
     walked, found = (_image(_scene(light, red, _lamp()), 256).mean(axis=(0, 1)) for light in ("walk", "corrected"))
@@ -239,6 +240,7 @@ def test_walks_are_added_for_an_image_of_more_samples_and_kept_for_one_of_fewer(
     assert walks[1] == walks[2] == pytest.approx(144 * 2**11 / 8, rel=0.3)
 
 
+@pytest.mark.slow
 def test_a_render_in_passes_has_walks_by_all_its_samples(scene: Any, few: None, tmp_path: Path) -> None:
     reference.render(scene, tmp_path / "image.exr", spp=2048)
     (told,) = scene.integrator().corrections.told()

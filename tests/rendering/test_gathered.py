@@ -103,6 +103,7 @@ def test_it_is_as_bright_as_the_model_sampled_where_the_index_is_below_that_outs
     assert (np.abs(g.mean(axis=(0, 1)) / mean - 1) < 0.03 + 4 * noise / mean).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("model", "light"), CASES)
 def test_its_pixels_differ_from_the_model_sampled_by_6_percent_at_most(model: str, light: str) -> None:
     a, b, one, two = _pictures(model, light)

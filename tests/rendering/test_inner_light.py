@@ -74,7 +74,8 @@ def _pictures(light: str) -> tuple[np.ndarray, np.ndarray]:
     return np.array(found[0]), np.array(found[1])
 
 
-@pytest.mark.parametrize("light", ["windows", pytest.param("floor", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("light", ["windows", "floor"])
 def test_light_is_that_of_traced_events_within_1_percent_and_beside_a_floor_within_2(light: str) -> None:
     traced, gathered = (x.mean(axis=(1, 2)) for x in _pictures(light))
     noise, most = traced.std(axis=0, ddof=1) / np.sqrt(3), 0.02 if light == "floor" else 0.01

@@ -113,6 +113,7 @@ INSIDE: dict[str, Callable[[], tuple[dict, dict[str, str]]]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [kind for kind in INSIDE if kind not in ("second medium",)])
 def test_walks_agree_with_the_volume_path_tracer_of_mitsuba(kind: str) -> None:
     """What is left out, is inside of others."""

@@ -88,6 +88,7 @@ def test_a_mesh_with_normals_looks_the_same_however_it_is_wound_flipped_and_mirr
         same(image(mesh(tmp_path, reverse, True, flip, mirror), "lamp", seed=2), upright)
 
 
+@pytest.mark.slow
 def test_a_sphere_looks_the_same_flipped_and_mirrored():
     upright = image({"type": "sphere", "radius": 4.0}, "lamp")
     for flip, sign in ((True, 1), (False, -1), (True, -1)):

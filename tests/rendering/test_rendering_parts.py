@@ -133,6 +133,7 @@ def test_integrators_around_ours_show_the_same_image(outer, integrator):
     assert abs(around.mean() / image(make(integrator), 512).mean() - 1) < 0.01
 
 
+@pytest.mark.slow
 def test_no_point_at_the_limb_of_a_lamp_outshines_the_image() -> None:
     # the density of points of a lamp over its area goes to 0 where it is seen at grazing angles; with this seed one
     # sample was 17 000 times as bright as the image
