@@ -57,7 +57,7 @@ FEWEST, MOST = 24, 1024  # of a point
 PART = 1 / 8  # of the samples of a transport matrix
 SPREADINGS = 4  # of what other surfaces send,
 BRIGHTEST = 1 / 128  # of the points, which share it no matter how bright
-FLIGHT = 0.05  # of flights go beyond where things inside are looked for
+FLIGHT = 0.05  # share of flights that are longer than the way on which things inside are looked for
 TRACED = 8  # one of so many directions by the cosine is traced further, where it meets a surface
 
 

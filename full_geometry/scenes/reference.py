@@ -320,9 +320,9 @@ class Limits:
 def _pass(start: Reference, scene: mi.Scene, integrator: mi.Integrator, limits: Limits) -> Reference:
     about, number, spp = start.about, start.passes, limits.next_spp(start if start.passes else None)
     started, sensor, seed = time.perf_counter(), about["sensor"], seeded(about["seed"], number)
-    corrected = is_bssrdf(integrator) and (integrator.settings.light == "corrected" or integrator.corrections.told())
-    samples = (start.spp + spp) * int(np.prod(sampled_size(scene.sensors()[sensor].film())))
-    if corrected:
+    # corrected light, as asked for or as chosen
+    if is_bssrdf(integrator) and (integrator.settings.light == "corrected" or integrator.corrections.told()):
+        samples = (start.spp + spp) * int(np.prod(sampled_size(scene.sensors()[sensor].film())))
         integrator.prepare(scene, _samples_of_light(start, samples, limits))
     image = mi.render(scene, sensor=sensor, integrator=integrator, seed=seed, spp=spp)
     image = finite_pixels(f"pass {number}", image)
@@ -333,8 +333,8 @@ def _pass(start: Reference, scene: mi.Scene, integrator: mi.Integrator, limits: 
     result = start.add(image, spp, time.perf_counter() - started)
     if not is_bssrdf(integrator):
         return result
-    if corrected:
-        made = integrator.corrections
+    made = integrator.corrections
+    if made.error is not None:
         error = (start.light_error * start.spp + made.error * spp) / result.spp
         light = {"error": float(f"{error:.6g}"), "now": float(f"{made.error:.6g}")}
         light |= {"samples": made.samples, "finest": made.finest}
