@@ -7,8 +7,9 @@ L_g what a model and `gathering` give for it, which has a bias that no time lowe
     L_o = L_g + a(w_o) C(x_o, w_o),    a C = E[W - L_g].
 
 C, a polynomial of w_o bent by the boundary and of what is painted there, is smooth where the model has the detail of
-light. It is fitted to W - L_g at random places and directions (`precomputed.surface_regression`). It stays until light
-or objects change; more walks make it finer. Walks find light precomputed where that is possible
+light; where a boundary is rough, a has the share of light that it lets in instead of F_t, which is 0 along the surface.
+It is fitted to W - L_g at random places and directions (`precomputed.surface_regression`). It stays until light or
+objects change; more walks make it finer. Walks find light precomputed where that is possible
 (`precomputed.unscattered_light`). All other light is traced by the walks of the image, which end at their second event
 (`walk_paths`). Where phase functions are narrow, light that has turned forwards alone is as narrow, and no deep light:
 paths go on by the share Π (1 - q) of their turns (`precomputed.forward_scattering`), and walks have the rest of it.
@@ -52,7 +53,7 @@ from full_geometry.settings import Settings
 from full_geometry.surface.varying import equivalent
 from full_geometry.surface.wrapped import surface_of
 from full_geometry.transport.models import lookup
-from full_geometry.walk.media import WalkMedia, sent_back
+from full_geometry.walk.media import WalkMedia, is_rough, sent_back
 from full_geometry.walk.random_walk import PATH_LANES
 from halfspace_sss.backend import clock
 from halfspace_sss.interrupts import checkpoint
@@ -65,6 +66,7 @@ ROOTS = (*R_4, GOLDEN)  # not the fifth power of the same root: directions would
 LEAST_ALBEDO = 1e-6
 SAMPLES_OF_LIGHT, FEWEST_OF_LIGHT = 4, 2**20  # of the image that light inside is precomputed for: of a walk, of all
 BRIGHTEST = 1 / 16384  # of the residuals of a launch, which are as bright as the next
+COSINES, OF_COSINE = 32, 4096  # of what a rough boundary lets in
 SEED = 500
 
 
@@ -157,6 +159,7 @@ class Corrections:
         self._walk: mi.Integrator | None = None
         self._alone: tuple = (None, None, [])
         self._gathered: list[Gathered | None] = []
+        self._lights: list[Gathered | None] = []
         self._known: list[SurfaceCorrection | None] = []
         self.seconds = 0.0
 
@@ -223,27 +226,28 @@ class Corrections:
             gathered = [by_shape.get(id(each.shape)) for each in media.objects]
         if not same_objects(gathered, self._gathered):
             self._gathered, self._known, walk.outgoing = gathered, [None] * len(gathered), None
+            self._lights = [g and replace(g, rough=let_in(media, k)) for k, g in enumerate(gathered)]
         if not samples and not alone:
             return walk if walk.outgoing is not None else None
 
         # ---- walks that are missing, in two halves
         number = int(np.clip(samples // SAMPLES_PER_WALK, FEWEST, MOST))
         launches = 2 * round(number / (2 * PER_LAUNCH))
-        missing = [k for k, g in enumerate(gathered) if g and (self._launches(k) < launches)]
+        missing = [k for k, g in enumerate(gathered) if g and self._launches(k) < launches]
         if missing or walk.outgoing is None:
             walk.outgoing = None
             tracer = walk.tracer(scene, SEED, max(SAMPLES_OF_LIGHT * number, FEWEST_OF_LIGHT))
             tracer = replace(tracer, visitor=replace(tracer.visitor, deep=True))
             for k in missing:
-                known = self._known[k]
-                first, halves = (known.launches, list(known.halves)) if known else (0, _nothing(gathered[k]))
+                known, light = self._known[k], self._lights[k]
+                first, halves = (known.launches, list(known.halves)) if known else (0, _nothing(light))
                 for launch in range(first, launches):
                     checkpoint()
                     seed = SEED + 10_000 * k + 1_000_000 * self._part + launch
-                    found = residuals(tracer, k, gathered[k], seed)
+                    found = residuals(tracer, k, light, seed)
                     halves[launch % 2] = [a + b for a, b in zip(halves[launch % 2], found)]
                 area = known.area if known else area_of(media, k)
-                self._known[k] = SurfaceCorrection.of(gathered[k], area, tuple(halves), launches)
+                self._known[k] = SurfaceCorrection.of(light, area, tuple(halves), launches)
             outgoing = OutgoingLight.of(media, [known and known.corrected for known in self._known])
             walk.take(scene, outgoing, tracer.visitor.unscattered)
             self.seconds = clock() - started
@@ -328,6 +332,23 @@ def _check(obj: TranslucentObject, settings: Settings, alone: bool) -> None:
         reason = f"walks take the orders of the surface, {orders!r}"
     if reason:
         raise ValueError(f"light of object {obj.geometry.name} must be sampled, got corrected: {reason}")
+
+
+def let_in(media: WalkMedia, k: int) -> mi.Texture1f | None:
+    """The share of light that the boundary of object k lets in, by the cosine of its direction, if it is rough."""
+    boundary, eta = media.boundaries[int(media.instance_table.kind[k])], float(media.row("eta", mi.Int32(k))[0])
+    if not is_rough(boundary):
+        return None
+    # eta² times the mean weight of refracted directions
+    mu = np.repeat((np.arange(COSINES) + 0.5) / COSINES, OF_COSINE)
+    u = [floats(np.tile(v, COSINES)) for v in lattice(OF_COSINE)]
+    si = dr.zeros(mi.SurfaceInteraction3f, len(mu))
+    si.wi, si.t = mi.Vector3f(floats(np.sqrt(1 - mu**2)), 0, floats(mu)), mi.Float(1)
+    ctx = mi.BSDFContext()
+    ctx.type_mask = mi.BSDFFlags.Transmission
+    _, value = boundary.sample(ctx, si, u[2], mi.Point2f(u[0], u[1]))
+    share = eta**2 * np.array(value, dtype=float).mean(axis=0).reshape(COSINES, OF_COSINE).mean(axis=1)
+    return mi.Texture1f(mi.TensorXf(share.astype(np.float32)[:, None]), use_accel=False, wrap_mode=dr.WrapMode.Clamp)
 
 
 def _number(halves: tuple[list[ResidualSums], list[ResidualSums]]) -> float:

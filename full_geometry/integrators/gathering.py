@@ -51,6 +51,7 @@ from full_geometry.walk.emission import emitter_pdf, mis_weight, sample_emitter
 from full_geometry.walk.media import WalkMedia, sent_back
 from halfspace_sss.backend import clock
 from halfspace_sss.interrupts import checkpoint
+from halfspace_sss.physics.fresnel import F_t
 
 DIRECTIONS = 2**18  # of all points of an object, by emitters, and as many by the cosine
 FEWEST, MOST = 24, 1024  # of a point
@@ -78,6 +79,7 @@ class Gathered:
         light: that arrives, less c.
         parts: independent estimates of it.
         c: mean radiance of the environment where alpha is known, else 0, see `lighting.EnvironmentMean`.
+        rough: light that a rough boundary lets in by the cosine, in place of F_t; None as models have it.
     """
 
     object: TranslucentObject
@@ -89,6 +91,7 @@ class Gathered:
     light: Incident | None = None
     parts: tuple[Incident, ...] = ()
     c: np.ndarray | float = 0.0
+    rough: mi.Texture1f | None = None
 
     @property
     def terms(self) -> int:
@@ -109,6 +112,13 @@ class Gathered:
 
     def factor(self, out: SurfacePoint, active: mi.Bool) -> mi.Spectrum:
         """L_o / B of an exit: a(w_o) R^e, or alpha in the channels where the model knows its directional albedo."""
+        a = self._smooth_factor(out, active)
+        if self.rough is None:
+            return a
+        mu = dr.maximum(dr.dot(out.w, out.n_out), 0)
+        return a * (self.rough.eval(mi.Float(mu))[0] / dr.maximum(F_t(mu, opaque(self.albedo.eta)), 1e-6))
+
+    def _smooth_factor(self, out: SurfacePoint, active: mi.Bool) -> mi.Spectrum:
         mu = dr.maximum(dr.dot(out.w, out.n_out), 0)
         if self.object.transport is None:
             return self.albedo(mu) * self.reflectance(out)
