@@ -174,7 +174,7 @@ class Corrections:
         """The objects of a scene, each at one place, where no model has light of them; None where models have it.
 
         Raises:
-            ValueError: they are at too many places, one is open, or all are in glass.
+            ValueError: they are at too many places, one is open, or none is outside of others.
         """
         if mi.is_spectral:  # refused with models
             return None
@@ -196,7 +196,7 @@ class Corrections:
             if objects and all(obj.gathered is None for obj in objects):
                 raise ValueError(
                     f"light must be sampled for object {objects[0].geometry.name}, of which nothing is outside of "
-                    "glass and other objects, got corrected: translucent_walk takes it"
+                    "other objects and of what overlaps it, got corrected: translucent_walk takes it"
                 )
             self._alone = media, state, objects
         return self._alone[2]
@@ -291,7 +291,8 @@ def area_of(media: WalkMedia, k: int) -> float:
 
 
 def _without_light(media: WalkMedia, k: int, scene: mi.Scene) -> TranslucentObject:
-    """Object k with points and a factor by its reflectance in place of gathered light; without, inside another."""
+    """Object k with points and a factor by its reflectance in place of gathered light; without, inside another.
+    Glass may be around the whole of it."""
     # ---- the object, with a medium of each channel, 1/(scene unit)
     kind = int(media.instance_table.kind[k])
     geometry, spec = media.objects[kind], media.specs[kind]
@@ -299,22 +300,29 @@ def _without_light(media: WalkMedia, k: int, scene: mi.Scene) -> TranslucentObje
     textured = None if spec.textured is None else spec.textured.scaled(media.mm_per_unit)
     obj = TranslucentObject(geometry, tuple(m.scaled(media.mm_per_unit) for m in channels), textured=textured)
 
-    # ---- points, none of them inside of others
+    # ---- points, none of them inside of others but of glass around all
     area = area_of(media, k)
     points = SurfacePoints.drawn(lambda u: entries(media, k, u), area, count_of(obj, area))
-    p, hidden = np.array(points.p, dtype=float), np.zeros(len(points), dtype=bool)
+    p, hidden, within = np.array(points.p, dtype=float), np.zeros(len(points), dtype=bool), 0
+    bits = np.array(media.inner.priorities.tables["bit"]) if media.overlaps else None
     for j, other in _around(media):
-        if j != k:
-            hidden |= is_inside(other[0], np.linalg.inv(other[1])[:3] @ np.vstack([p, np.ones(p.shape[1])]))
+        if j == k:
+            continue
+        inside = is_inside(other[0], np.linalg.inv(other[1])[:3] @ np.vstack([p, np.ones(p.shape[1])]))
+        if inside.all() and j >= len(media.instance_table) and bits[j] < bits[k]:
+            within |= int(bits[j])
+        else:
+            hidden |= inside
     if hidden.all():
         return obj
     points = points.some(np.flatnonzero(~hidden))
 
     # ---- a = F_t times the reflectance, which textures give at each exit
     R = [1.0] * len(channels) if textured else [float(sent_back(np, m.albedo, m.g)) for m in channels]
-    albedo = Albedo(np.outer(R, [1.0, 0.0, 0.0]), float(channels[0].eta))
+    eta = media.inner.priorities.index_within(k, within) if within else float(channels[0].eta)
+    albedo = Albedo(np.outer(R, [1.0, 0.0, 0.0]), eta)
     values = floats(np.zeros(len(points) * len(channels)))
-    return replace(obj, gathered=Gathered(obj, points, albedo, values, None))
+    return replace(obj, gathered=Gathered(obj, points, albedo, values, None, within=within))
 
 
 def _around(media: WalkMedia) -> list[tuple[int, tuple]]:
@@ -390,13 +398,14 @@ def residuals(tracer: PathTracer, k: int, gathered: Gathered, seed: int) -> list
     si = media.instance_scene.intersect(scene, ray, mi.RayFlags.All)
     met = si.is_valid() & (media.index_of(si, si.is_valid()) == number)
     if media.overlaps:
-        met &= _bare(media, media.instance_scene.intersect(scene, mi.Ray3f(ray.o, w), mi.RayFlags.All), w)
+        beyond = media.instance_scene.intersect(scene, mi.Ray3f(ray.o, w), mi.RayFlags.All)
+        met &= _bare(media, beyond, w, dr.opaque(mi.UInt32, gathered.within))
     si = media.seen(si, number, -w)
     out = surface_point(si.p, si.n, si.sh_frame.n, w)._replace(medium=gathered.object.medium_at(si))
     dr.eval(ray, out, met)
 
     # ---- W of a walk, and L_g = a B
-    W, _, _ = tracer.trace(ray, PATH_LANES, (seed,))
+    W, _, _ = replace(tracer, within=gathered.within).trace(ray, PATH_LANES, (seed,))
     a, R = gathered.factor(out, met), gathered.reflectance(out)
     r = W - gathered.radiance(out, met)
     point, near = gathered.points.nearest(out.p, out.n, way_in_is_clear(media, si, number, w, met))
@@ -426,11 +435,12 @@ def residuals(tracer: PathTracer, k: int, gathered: Gathered, seed: int) -> list
     return found
 
 
-def _bare(media: WalkMedia, beyond: mi.SurfaceInteraction3f, w: mi.Vector3f) -> mi.Bool:
-    """Whether a ray along w that meets `beyond` began outside of all that overlaps."""
+def _bare(media: WalkMedia, beyond: mi.SurfaceInteraction3f, w: mi.Vector3f, within: mi.UInt32) -> mi.Bool:
+    """Whether a ray along w that meets `beyond` began outside of all that overlaps but glass around the object."""
     number = media.inner.priorities.instance_table.number(beyond, beyond.is_valid())
     beyond = media.seen(beyond, media.index_of(beyond, beyond.is_valid()), w)
-    return (number < 0) | (dr.dot(beyond.n, w) < 0)
+    around = (media.inner.priorities.bit_of(number) & within) != 0
+    return (number < 0) | (dr.dot(beyond.n, w) < 0) | around
 
 
 def _steadied(r: np.ndarray, a: np.ndarray) -> np.ndarray:

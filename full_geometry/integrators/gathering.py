@@ -80,6 +80,7 @@ class Gathered:
         parts: independent estimates of it.
         c: mean radiance of the environment where alpha is known, else 0, see `lighting.EnvironmentMean`.
         rough: light that a rough boundary lets in by the cosine, in place of F_t; None as models have it.
+        within: glass in which the object is, see `walk.priorities`.
     """
 
     object: TranslucentObject
@@ -92,6 +93,7 @@ class Gathered:
     parts: tuple[Incident, ...] = ()
     c: np.ndarray | float = 0.0
     rough: mi.Texture1f | None = None
+    within: int = 0
 
     @property
     def terms(self) -> int:
@@ -183,7 +185,8 @@ class OutgoingLight:
     Args:
         media: the objects as walks know them.
         lights: of each by its number; None of those that no path enters from outside.
-        known: whether there is light of an object, by its number.
+        tables: by the number of an object, whether its light is `known`, the index `eta` of its boundary to what is
+            around it, and `within` what glass that is.
         points: of all of them, joined.
         values: B of these, for each channel so many terms.
         terms: of `directional`, and of `painted` where an object has textures.
@@ -191,7 +194,7 @@ class OutgoingLight:
 
     media: WalkMedia
     lights: list[Gathered | None]
-    known: mi.Bool
+    tables: dict[str, mi.Bool | mi.Float | mi.UInt32]
     points: SurfacePoints
     values: mi.Float
     terms: int
@@ -204,16 +207,22 @@ class OutgoingLight:
         none = replace(some[0].points, h=1.0, first=dr.zeros(mi.UInt32, int(some[0].points.cells.prod()) + 1))
         points = SurfacePoints.joined([none if light is None else light.points for light in lights])
         values = dr.concat([(light or some[0]).with_terms(terms) for light in lights])
-        known = mi.Bool([light is not None for light in lights])
-        dr.make_opaque(values, known)
-        return cls(media, lights, known, points, values, terms)
+        tables = {
+            "known": mi.Bool([light is not None for light in lights]),
+            "eta": mi.Float([(light or some[0]).albedo.eta for light in lights]),
+            "within": mi.UInt32([light.within if light else 0 for light in lights]),
+        }
+        dr.make_opaque(values, tables)
+        return cls(media, lights, tables, points, values, terms)
 
     def radiance(
-        self, si: mi.SurfaceInteraction3f, k: mi.Int32, w: mi.Vector3f, active: mi.Bool
+        self, si: mi.SurfaceInteraction3f, k: mi.Int32, w: mi.Vector3f, within: mi.UInt32 | tuple[()], active: mi.Bool
     ) -> tuple[mi.Bool, mi.Spectrum]:
-        """Whether light that leaves object k is known, and that along w from a point with normals outwards."""
+        """Whether light that leaves object k is known, and that along w from a point with normals outwards.
+        `within`: the glass that is around the point."""
         place = self.media.place_of(k)
-        active = active & dr.gather(mi.Bool, self.known, place)
+        row = dr.gather(dict, self.tables, place)
+        active = active & row["known"] & ((within == row["within"]) if len(within) else True)
         active = way_in_is_clear(self.media, si, k, w, active)
         out, a, R = surface_point(si.p, si.n, si.sh_frame.n, w), mi.Spectrum(0), mi.Spectrum(1)
         # a(w) and R of each object, with the medium that textures have here
@@ -222,7 +231,7 @@ class OutgoingLight:
             if light is not None:
                 here, at = active & self.media.has_shape(k, kind), out._replace(medium=light.object.medium_at(si))
                 a, R = dr.select(here, light.factor(at, here), a), dr.select(here, light.reflectance(at), R)
-        B = _blended(self.points, self.values, self.terms, out, self.media.row("eta", k), active, R, place)
+        B = _blended(self.points, self.values, self.terms, out, row["eta"], active, R, place)
         return active, dr.select(active & (dr.dot(w, out.n_out) > 0), a * B, 0)
 
 

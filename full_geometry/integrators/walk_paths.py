@@ -30,7 +30,6 @@ from full_geometry.walk.emitter_connections import Departure, EmitterDirections,
 from full_geometry.walk.media import Coefficients, WalkMedia, WalkMedium, interaction_of, ray_of
 from full_geometry.walk.random_walk import (
     OUTSIDE,
-    Behind,
     Crossing,
     Event,
     Visitor,
@@ -597,6 +596,7 @@ class PathTracer:
         hide_emitters: whether the camera sees no emitters.
         layers: whether emission that the camera sees, at once or in the mirror of an object, is also told apart.
         apart: by the number of a ray, whether light is without its `seen_emission`.
+        within: glass that is around all rays where they begin, see `walk.priorities`.
     """
 
     visitor: LightVisitor
@@ -605,6 +605,7 @@ class PathTracer:
     hide_emitters: bool
     layers: bool = False
     apart: mi.Bool | None = None
+    within: int = 0
 
     def trace(
         self,
@@ -632,6 +633,8 @@ class PathTracer:
 
         def begin(index: mi.UInt32, rng: mi.PCG32) -> CameraPath:
             path = _begin(rays, total, index, rng, self.visitor, bool(scores))
+            if media.overlaps:
+                path.walk.within = dr.opaque(mi.UInt32, self.within, dr.width(index))
             if self.visitor.sees_through and exits is None:  # of all orders, the lowest too
                 path.walk.kept = dr.full(mi.Spectrum, 1, dr.width(index))
             return replace(path, emission=dr.zeros(mi.Spectrum, dr.width(index))) if self.layers else path
@@ -755,8 +758,8 @@ class PathTracer:
 
         # ---- deep light that is known, unless the last event has had it: L += throughput a C.Y
         if self.visitor.outgoing is not None:
-            held, deep = self.visitor.outgoing.radiance(si, near, -walk.d, _in_air(translucent, behind) & ~light.ended)
-            L = L + walk.weight * deep
+            held, L_o = self.visitor.outgoing.radiance(si, near, -walk.d, walk.within, translucent & ~light.ended)
+            L = L + walk.weight * L_o
 
         # ---- emitters in the mirror of a smooth boundary, and behind it: F L_e, (1 - F) T (1 - F') L_e
         mirrored, seen, L, p = self._seen(L, p, si, bsdf, near, translucent & lit)
@@ -867,10 +870,6 @@ def _along_mirror(
     return replace(walk, o=o, d=d, weight=walk.weight * value), active & (bs.pdf > 0)
 
 
-def _in_air(translucent: mi.Bool, behind: Behind | None) -> mi.Bool:
-    return translucent if behind is None else translucent & ~behind.unlit
-
-
 def _same(p: CameraPath) -> CameraPath:
     return p
 
@@ -890,8 +889,6 @@ def _begin(
     no, first = dr.full(mi.Bool, False, lanes), dr.full(mi.UInt32, 0, lanes)
     wavelengths = dr.gather(mi.Spectrum, rays.wavelengths, index, known) if mi.is_spectral else ()
     walk = start_walk(o, d, rng, media.unknown(lanes, wavelengths))
-    if media.overlaps:
-        walk.within = dr.full(mi.UInt32, 0, lanes)
     stay = Stay.none(lanes, media.textured) if scored else ()
     yes = dr.full(mi.Bool, True, lanes)
     return CameraPath(index, walk, start_record(lanes, scored, visitor.forward, visitor.splits), no, first, yes, stay)

@@ -128,6 +128,11 @@ class Priorities:
         """The boundary of member k to what is outside of all."""
         return self.boundaries[int(self.tables["boundary"][k])]
 
+    def index_within(self, k: int, within: int) -> float:
+        """The index of member k over that of what things are around it there."""
+        row = int(self.tables["boundary"][k]) + within.bit_length()
+        return index_of(self.boundaries[row])
+
     def bit_of(self, number: mi.Int32, active: mi.Bool | bool = True) -> mi.UInt32:
         """The bit of a thing by its number, which may be -1; 0 of what is no member."""
         return dr.gather(mi.UInt32, self.tables["bit"], dr.maximum(number, 0), active & (number >= 0))

@@ -398,3 +398,17 @@ def test_light_toward_a_ball_in_a_clear_one_is_that_of_walks_within_two_and_a_ha
         for light, spp, n in (("walk", 2048, 4), ("corrected", 512, 1))
     )
     np.testing.assert_allclose(corrected, walked, rtol=0.025)
+
+
+@pytest.mark.slow
+def test_light_of_a_ball_in_glass_and_of_one_in_a_bell_jar_is_that_of_walks_within_four_percent() -> None:
+    wax = {"type": "translucent", "sigma_t": 8.0, "albedo": ".95,.9,.6", "eta": 1.4}
+    glass = {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}
+    hollow = {"type": "dielectric", "int_ior": 1.0, "ext_ior": 1.5}
+    shown = {"glass": _ball(-0.5, 0, 0.48, glass), "jar": _ball(0.5, 0, 0.48, glass)}
+    shown |= {"wax": _ball(-0.5, 0, 0.3, wax), "other": _ball(0.5, 0, 0.3, wax), "hollow": _ball(0.5, 0, 0.4, hollow)}
+    walked, corrected = (
+        _image(_scene(light, wax, {**shown, **_lamp()}), spp) for light, spp in (("walk", 1024), ("corrected", 256))
+    )
+    halves = (image.reshape(12, 2, 6, 3).mean(axis=(0, 2)) for image in (corrected, walked))
+    np.testing.assert_allclose(*halves, rtol=0.04)  # one correction is known to 1 %

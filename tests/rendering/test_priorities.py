@@ -239,10 +239,10 @@ def test_models_refuse_what_overlaps() -> None:
         scene.integrator().render(scene, spp=1)
 
 
-def test_corrected_light_refuses_objects_that_are_all_in_glass() -> None:
-    things = {"glass": _ball(1.0, bsdf=GLASS), "wax": _ball(0.5, bsdf=CREAM)}
+def test_corrected_light_refuses_objects_that_glass_hides() -> None:
+    things = {"glass": _ball(1.0, bsdf=GLASS), "wax": _ball(0.5, bsdf={**CREAM, "priority": -1.0})}
     scene = _view(things, integrator={"type": "bssrdf", "light": "corrected"})
-    with pytest.raises(ValueError, match="must be sampled for object 'wax', of which nothing is outside of glass"):
+    with pytest.raises(ValueError, match="must be sampled for object 'wax', of which nothing is outside of other"):
         scene.integrator().render(scene, spp=1)
 
 
