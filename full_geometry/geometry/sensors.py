@@ -64,7 +64,7 @@ def rays_by(
     n = (int(dr.prod(size)) if pixels is None else dr.width(pixels)) * spp
     index, width = dr.arange(mi.UInt32, n) // dr.opaque(mi.UInt32, spp), dr.opaque(mi.UInt32, int(size[0]))
     index = index if pixels is None else dr.gather(mi.UInt32, pixels, index)
-    first, scale = film.crop_offset() - border, 1 / mi.ScalarVector2f(film.crop_size())
+    first, scale = mi.ScalarVector2i(film.crop_offset()) - border, 1 / mi.ScalarVector2f(film.crop_size())
     offset = -mi.ScalarVector2f(film.crop_offset()) * scale
     first, scale, offset = (mi.Vector2i(first), mi.Vector2f(scale), mi.Vector2f(offset))
     dr.make_opaque(first, scale, offset)  # a kernel then serves all crops

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from rendered import surface
 
+from full_geometry.geometry.sensors import rays_by, seeded_sampler
+
 mi = pytest.importorskip("mitsuba")
 
 INTEGRATORS = ("bssrdf", "translucent_walk")
@@ -79,6 +81,18 @@ def test_a_sensor_that_moves_into_an_object_or_stands_there_beside_the_scene_is_
     parameters["sensor.to_world"] = mi.Transform4f(within["to_world"].matrix)
     parameters.update()
     assert refusal(scene) == "the camera must be outside of every object, got it inside 'ball'"
+
+
+def test_a_film_that_samples_its_border_has_as_many_samples_of_every_pixel_there():
+    film = {**FILM, "rfilter": {"type": "gaussian"}, "sample_border": True, "crop_offset_x": 1, "crop_width": 3}
+    sensor = mi.load_dict(camera(30.0, film))
+    _, _, position = rays_by(sensor, seeded_sampler(sensor, 4, 1))
+    border = sensor.film().rfilter().border_size()
+    columns, rows = np.floor(np.array(position)).astype(int)
+    assert border > 1
+    found = {pair: int(((columns == pair[0]) & (rows == pair[1])).sum()) for pair in zip(columns, rows)}
+    places = ((1 + x, y) for x in range(-border, 3 + border) for y in range(-border, 4 + border))
+    assert found == dict.fromkeys(places, 4)
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
