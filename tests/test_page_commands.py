@@ -28,7 +28,9 @@ PAGES = ["README.md", *(f"docs/{name}.md" for name in (
     "cluster", "plugins", "biomedical", "errors", "figures", "add_model",
 ))]  # fmt: skip
 LESS = {  # what a command is given beside, by the longest of these that it starts with
-    "curves": "--paths 20000 --theta-i 0",
+    "curves": "--paths 20000 --theta-i 0 --model better_dipole --model neural",
+    "curves marble": "--paths 20000 --theta-i 0",
+    "curves --sigma-t": "--paths 20000 --theta-i 0",
     "render": "--spp 2",
     "render scene.xml --model path_traced --target-error": "--target-error 0.5",
     "render toy.xml": "--spp 2 -D size=32",
@@ -41,8 +43,9 @@ LESS = {  # what a command is given beside, by the longest of these that it star
     "errors materials --held-out": "--events 1e5 --held-out 2",
     "errors object": "--exits 16",
     "errors truths": "--model better_dipole",
-    "maps": "--grid 2,16,6,4 --target-error 0.5",
-    "maps marble ketchup --workers": "--grid 2,16,6,4 --target-error 0.5 --workers 1",
+    "maps": "--grid 2,16,6,4 --paths 2048 --channel R",
+    "maps --sigma-t": "--grid 2,16,6,4 --paths 2048",
+    "maps marble ketchup --workers": "--grid 2,16,6,4 --paths 2048 --channel R --workers 1",
     "validate": "--quick --rows T0134",
     "figures all fig09": "--quality draft",
     "figures compute": "--quality draft",
@@ -89,6 +92,7 @@ from figures.command_line import main
 from figures.parts import command as figure_command
 from full_geometry.learning import model_errors as errors_of_objects
 from full_geometry.learning import training
+from full_geometry.transport import any_shape
 from halfspace_sss.comparison import model_errors, reflectance_curves
 from halfspace_sss.maps.noisy_maps import CellGrid
 from halfspace_sss.neural.training.train_material import FAST
@@ -102,6 +106,7 @@ fig10.WALKS["draft"], fig10.accepting = 2**14, lambda medium: ["better_dipole", 
 figure_command.MOST_WORKERS = 1  # others would import and compile for themselves
 # walks of numbers that nobody reads
 training.EXITS, training.WALKS, training.SAMPLES = 16, 256, 64
+any_shape.WALKS = any_shape.PAIRS = 2**12, 2**12
 few = dataclasses.replace(training.STANDARD, chunk=2**12)
 training.TrainingPlan = functools.partial(training.TrainingPlan, recipe=few)
 errors_of_objects.errors_of.__kwdefaults__.update(walks=256, samples=64)
@@ -109,6 +114,8 @@ quick_light.gather_by_few(setattr)
 model_errors.GRID = CellGrid(16, 8)
 train_material = sys.modules["halfspace_sss.neural.training.train_material"]  # a function of the package has its name
 train_material.FAST = train_material.STANDARD = dataclasses.replace(FAST, n_groups=16, events=1e5, grid=CellGrid(8, 4))
+recipes = train_material.MaterialRecipe
+recipes.__init__ = functools.partialmethod(recipes.__init__, grid=CellGrid(8, 4))
 
 
 def command(line):

@@ -43,7 +43,7 @@ SMALL = {  # a small run of each command, and what it refuses
 HARNESS = """
 import atexit, dataclasses, gc, json, os, signal, subprocess, sys
 from pathlib import Path
-import matplotlib.pyplot, pandas, scipy.interpolate, torch, zarr  # once for all runs: each is a fork
+import matplotlib.pyplot, pandas, scipy.interpolate, torch._dynamo, xarray, zarr  # once for all runs: each is a fork
 import quick_kernels
 from halfspace_sss.cli import shared
 from halfspace_sss.comparison import reflectance_curves
