@@ -17,7 +17,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from benchmarks.bench import Row
+from benchmarks.bench import REPEATS, Row
 from full_geometry.cli.variants import use_mitsuba
 
 # object and light: three shapes, three media
@@ -130,8 +130,8 @@ def bench_edits(variant: str, size: int) -> Iterator[Row]:
             scene = load()
             _timed(scene, _unchanged)
             row: Row = {"way": way, "pixels": size, "ready_s": time.perf_counter() - started}
-            row["light_s"] = min(_timed(scene, turned) for _ in range(3))
-            yield row | {"camera_s": min(_timed(scene, nearer) for _ in range(3))}
+            row["light_s"] = min(_timed(scene, turned) for _ in range(REPEATS))
+            yield row | {"camera_s": min(_timed(scene, nearer) for _ in range(REPEATS))}
 
 
 def _unchanged(scene: object) -> None:

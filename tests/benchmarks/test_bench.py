@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 import halfspace_sss
 from benchmarks import __main__ as cli
+from benchmarks import bench, bench_renders
 from benchmarks import bench_command as cli_bench
 from halfspace_sss import Medium
 
@@ -34,7 +35,9 @@ def _rows(path: Path) -> list[dict[str, str]]:
 def finished(tmp_path_factory: Any) -> tuple[Any, Path]:
     """One quick run of all parts, and its folder."""
     folder = tmp_path_factory.mktemp("run") / "bench"
-    return _invoke("--quick", "--out", str(folder)), folder
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bench, "REPEATS", 1)
+        return _invoke("--quick", "--out", str(folder)), folder
 
 
 def test_every_part_has_a_file_and_all_are_in_the_json(finished: tuple[Any, Path]) -> None:
@@ -97,7 +100,10 @@ def test_guided_walks_have_the_reflectance_of_plain_ones(tmp_path: Path) -> None
 
 
 @pytest.mark.slow
-def test_traces_and_edits_are_measured_on_a_cpu_too(tmp_path: Path, little_light: None) -> None:
+def test_traces_and_edits_are_measured_on_a_cpu_too(
+    tmp_path: Path, little_light: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bench_renders, "REPEATS", 1)
     assert _invoke("--quick", "--only", "trace", "--only", "edits", "--out", str(tmp_path)).exit_code == 0
     assert [row["way"] for row in _rows(tmp_path / "bench_edits.csv")] == ["better_dipole, gathered", "walk"]
     (row,) = _rows(tmp_path / "bench_trace.csv")
