@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shlex
@@ -42,8 +43,13 @@ COMMANDS = list(
     )
 )
 RUN = """
+import contextlib
 import dataclasses
+import io
+import json
+import os
 import sys
+import traceback
 
 import quick_kernels
 import quick_light
@@ -53,19 +59,39 @@ quick_kernels.compile_quickly()
 quick_light.gather_by_few(setattr)
 fit = inverse.fit
 inverse.fit = lambda *arguments, settings: fit(*arguments, settings=dataclasses.replace(settings, steps=2))
-for number, text in enumerate(sys.argv[1:]):
-    exec(compile(text, f"snippet {number}", "exec"), {"__name__": "__main__"})
-    print(f"\\nend of {number}", flush=True)
+top = os.getcwd()
+for page, texts in json.loads(sys.argv[1]).items():
+    os.makedirs(os.path.join(top, page))
+    os.chdir(os.path.join(top, page))
+    printed, error = [], ""
+    try:
+        for number, text in enumerate(texts):
+            told = io.StringIO()
+            with contextlib.redirect_stdout(told):
+                exec(compile(text, f"snippet {number}", "exec"), {"__name__": "__main__"})
+            printed.append(told.getvalue())
+    except Exception:
+        error = traceback.format_exc()
+    print("\\nRAN", json.dumps([page, printed, error]), flush=True)
 """
 
 
+@pytest.fixture(scope="module")
+def ran(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[list[str], str]]:
+    """By page, what each snippet printed, and an error; one process, since all share its imports and kernels."""
+    run = subprocess.run(
+        [sys.executable, "-c", RUN, json.dumps(SNIPPETS)], cwd=tmp_path_factory.mktemp("pages"), capture_output=True,
+        text=True, env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )  # fmt: skip
+    rows = [json.loads(line.removeprefix("RAN ")) for line in run.stdout.splitlines() if line.startswith("RAN ")]
+    assert run.returncode == 0 and [page for page, *_ in rows] == list(SNIPPETS), run.stderr
+    return {page: (printed, error) for page, printed, error in rows}
+
+
 @pytest.mark.parametrize("page", SNIPPETS)
-def test_snippets_run_and_print(page: str, tmp_path: Path) -> None:
-    command = [sys.executable, "-c", RUN, *SNIPPETS[page]]  # one process: imports and kernels are shared
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=env)
-    assert run.returncode == 0, run.stderr
-    printed = re.split(r"\nend of \d+\n", run.stdout)[:-1]
+def test_snippets_run_and_print(page: str, ran: dict[str, tuple[list[str], str]]) -> None:
+    printed, error = ran[page]
+    assert not error, error
     assert len(printed) == len(SNIPPETS[page])
     assert all(text.strip() for text in printed)
 
