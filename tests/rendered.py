@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import threading
 from collections.abc import Iterator
 
 import numpy as np
@@ -47,19 +48,35 @@ def render(scene: dict, spp: int, seed: int = 1) -> np.ndarray:
     return np.array(mi.render(mi.load_dict(scene), spp=spp, seed=seed))
 
 
+_lock, _inside, _threads = threading.Lock(), 0, 0
+
+
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """Let Dr.Jit work in one thread where tests run side by side: a second one spins between launches."""
+    """Let Dr.Jit work in one thread where tests run side by side: a second one spins between launches.
+
+    The last to leave gives the others back, without which Mitsuba waits forever for EXR files.
+    """
+    global _inside, _threads
     import drjit as dr
 
-    threads = dr.thread_count()
-    dr.sync_thread()
-    dr.set_thread_count(1 if "PYTEST_XDIST_WORKER" in os.environ else threads)
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        yield
+        return
+    with _lock:
+        if _inside == 0:
+            dr.sync_thread()
+            _threads = dr.thread_count()
+            dr.set_thread_count(1)
+        _inside += 1
     try:
         yield
     finally:
-        dr.sync_thread()
-        dr.set_thread_count(threads)
+        with _lock:
+            _inside -= 1
+            if _inside == 0:
+                dr.sync_thread()
+                dr.set_thread_count(_threads)
 
 
 LANES = 2**21  # of a launch; beyond, what it takes to trace a render in Python is small
