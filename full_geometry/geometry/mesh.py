@@ -41,6 +41,19 @@ def vertex_normals(shape: mi.Shape) -> np.ndarray:
     return np.array(mi.traverse(shape)[NORMALS]).reshape(-1, 3)
 
 
+def bend_of_normals(mesh: mi.Shape) -> float:
+    """How far normals of vertices are from those of the faces about them, radians: mean over corners, by area."""
+    if not mesh.has_vertex_normals():
+        return 0.0
+    a, b, c = face_corners(mesh)
+    n, m = np.cross(b - a, c - a), vertex_normals(mesh)[face_vertices(mesh)]
+    area = np.linalg.norm(n, axis=1)
+    size = area[:, None] * np.linalg.norm(m, axis=2)
+    cosines = np.abs(np.einsum("fi,fki->fk", n, m)) / np.where(size > 0, size, 1)
+    angles = np.where(size > 0, np.arccos(np.minimum(cosines, 1)), 0)
+    return float(angles.mean(axis=1) @ area / max(area.sum(), np.finfo(float).tiny))
+
+
 def set_vertex_normals(mesh: mi.Mesh, normals: np.ndarray) -> None:
     """Replace the normals of the vertices by others, shape (vertices, 3)."""
     parameters = mi.traverse(mesh)

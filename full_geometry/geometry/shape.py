@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -247,6 +248,11 @@ class Geometry:
     def upright(self) -> bool:
         """Whether every normal points outwards."""
         return self.sign > 0 and self.signs is None and self.agree
+
+    @functools.cached_property
+    def bend_of_normals(self) -> float:
+        """Mean angle of interpolated normals with the surface, radians; 0 of shapes other than meshes."""
+        return mesh.bend_of_normals(self.shape) if self.shape.is_mesh() else 0.0
 
     @property
     def curvature_sign(self) -> float:

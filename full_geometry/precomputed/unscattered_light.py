@@ -59,6 +59,7 @@ DEPTHS = 3.6, 9.0  # mean free paths below the surface, at which cells are coars
 ALONG, FORWARD_ALONG = 6, 1  # points on a segment of a ray; forward events part it into many
 FEWEST_POINTS, MOST_POINTS = 2**14, 2**18  # of the surface that find its cells, of all and at once
 MOST_INTEGER = 2**15 - 1  # of 16 bits, for a direction of 1
+MOST_BENT = math.radians(35)  # of 29 light was within .5 %, of 38 to 55 it was 1 to 5 % too bright
 MOST_TRUNCATED = 0.1  # abs(g) beside textures of media: at 0.3 and 0.5 light under a lamp was 2 to 3 % off
 FEWEST_PATHS = 2**14  # of scattered light, from each object
 ROULETTE = 0.1  # part of its light below which a reflected ray may end
@@ -249,6 +250,11 @@ def obstacle(media: WalkMedia) -> str:
     for obj, inside, around in zip_longest(media.objects, media.specs, media.wrappings):
         if not obj.closed:
             return f"object {obj.name} is not closed"
+        if obj.bend_of_normals > MOST_BENT:
+            return (
+                f"normals of object {obj.name} are bent by {math.degrees(obj.bend_of_normals):.0f} degrees on average, "
+                f"above {math.degrees(MOST_BENT):.0f}, as on a cube with smooth shading"
+            )
         if inside.textured is not None and "sigma_t" not in inside.textured.constants:
             return f"sigma_t of object {obj.name} has a texture, and each walk takes its own value"
         if around is not None and (around.mixes or around.bend is not None):

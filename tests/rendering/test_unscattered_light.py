@@ -369,13 +369,14 @@ def test_the_mirror_image_of_a_lamp_that_fills_a_small_part_of_a_pixel_is_found(
     assert glint == pytest.approx(3 * 20 * 0.0293 * (0.4 * 2.5 / (29 + 2.5) / pixel) ** 2, rel=0.15)
 
 
-def _mesh_ball(folder: Path) -> str:
-    """The file of a ball of radius 5 with normals."""
+def _mesh_ball(folder: Path, rows: int = 64) -> str:
+    """The file of a ball of radius 5 with normals, by rows of faces with twice as many columns."""
     from full_geometry.geometry.mesh import fill, set_vertex_normals
 
-    theta, phi = np.meshgrid(np.linspace(0, np.pi, 65), np.linspace(0, 2 * np.pi, 129), indexing="ij")
+    columns = 2 * rows + 1
+    theta, phi = np.meshgrid(np.linspace(0, np.pi, rows + 1), np.linspace(0, 2 * np.pi, columns), indexing="ij")
     d = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1).reshape(-1, 3)
-    at = np.arange(65 * 129).reshape(65, 129)
+    at = np.arange(len(d)).reshape(-1, columns)
     a, b, c, e = (v.ravel() for v in (at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]))
     faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, e], axis=1)])
     ball = mi.Mesh("ball", len(d), len(faces), has_vertex_normals=True)
@@ -439,6 +440,12 @@ def test_the_layer_of_emission_holds_the_mirror_and_what_is_behind_the_object() 
 def test_light_that_cannot_be_precomputed_is_refused_by_its_reason(surface: dict, reason: str) -> None:
     with pytest.raises(ValueError, match=f"light must be auto or sampled, got 'precomputed': .*{reason}"):
         mi.render(_scene("precomputed", surface, lamp=_lamp()), spp=1)
+
+
+def test_light_is_not_precomputed_in_an_octahedron_with_smooth_shading(tmp_path: Path) -> None:
+    shape = {"type": "ply", "filename": _mesh_ball(tmp_path, 2)}
+    with pytest.raises(ValueError, match="normals of object 'object' are bent by 55 degrees on average, above 35"):
+        mi.render(_scene("precomputed", MEDIUM, shape, lamp=_lamp()), spp=1)
 
 
 @pytest.mark.parametrize("light", ["auto", "precomputed", "sampled"])
