@@ -1,7 +1,7 @@
 """Points of a surface that hold what varies slowly over it, and a lookup that blends those near any place.
 
-Points are a low-discrepancy set over the area, and more where that leaves gaps. Between them a value is blended with
-the weights
+Points are random places at a distance from each other (Poisson disks), the first of them farther apart. Between them a
+value is blended with the weights
 
     w_j = (1 - d_j² / h²)² max(n_j.n, 0)²,    d_j < h,
 
@@ -34,8 +34,8 @@ from full_geometry.geometry.points import (
 from full_geometry.geometry.shape import Geometry
 from halfspace_sss.arrays import aligned
 
-PLACES = 2**17  # that must have a point in reach
-LOOKS = (23, 24)  # seeds of such places
+PER_POINT, APART = 8, 0.735  # random places for each point; least distance of points over the mean of a square lattice
+COARSEST, SEED = 64, 22  # places at the largest distance; seed of places
 REACH = 2.0  # h over the mean distance of points
 MOST_CELLS = 2**22
 LIKE = 0.2  # difference of logarithms of colours that are blended
@@ -89,16 +89,13 @@ class SurfacePoints:
     @classmethod
     def drawn(cls, draw: Callable[[list[mi.Float]], EntrySample], area: float, count: int) -> SurfacePoints:
         """`count` points of a surface that `draw` makes of three uniform numbers each."""
-        # a low-discrepancy set over the area, then points where random places have none in reach
-        p, n, n_out, _, face, _ = draw([floats(v) for v in lattice(count)])
+        # of random places some at a distance from each other, and all others near these
+        at = draw([floats(v) for v in np.random.default_rng(SEED).random((3, PER_POINT * count)).astype(np.float32)])
+        spacing = float(np.sqrt(area / count))
+        kept = _apart(*(np.array(v, dtype=float).T for v in (at.p, at.n)), APART * spacing)
+        p, n, n_out, face = dr.gather(tuple, (at.p, at.n, at.n_out, at.face), aligned(mi.UInt32, kept))
         dr.eval(p, n, n_out, face)
-        h = REACH * float(np.sqrt(area / count))
-        result = cls(p, n, n_out, face, *_grid(np.array(p).T, h))
-        for seed in LOOKS:
-            sparse, result = result, result._without_gaps(draw, seed)
-            if result is sparse:
-                break
-        return result
+        return cls(p, n, n_out, face, *_grid(np.array(p).T, REACH * spacing))
 
     @classmethod
     def joined(cls, parts: Sequence[SurfacePoints]) -> SurfacePoints:
@@ -119,31 +116,6 @@ class SurfacePoints:
         tables = h, low, counts, mi.UInt32(cells[:-1].tolist())
         dr.make_opaque(tables)
         return cls(*rows, 0.0, np.zeros(3), np.zeros(3), first, listed, tables)
-
-    def _without_gaps(self, draw: Callable[[list[mi.Float]], EntrySample], seed: int) -> SurfacePoints:
-        """With points where random places have none in reach: faces in rows can be in step with the set."""
-        u = np.random.default_rng(seed).random((3, PLACES)).astype(np.float32)
-        at = draw([floats(v) for v in u])
-        missed = np.flatnonzero(~np.array(self.nearest(at.p, at.n, mi.Bool(True))[1]))
-        if not len(missed):
-            return self
-        p, n = (np.array(v, dtype=float)[:, missed].T for v in (at.p, at.n))
-        # of the places that are missed one for all within h / 2 that face the same way
-        near = cKDTree(p).query_ball_point(p, 0.5 * self.h)
-        left, kept = np.ones(len(missed), dtype=bool), []
-        for k, others in enumerate(near):
-            if left[k]:
-                kept.append(k)
-                others = np.array(others)
-                left[others[n[others] @ n[k] > 0.5]] = False
-        chosen, old = missed[kept], (self.p, self.n, self.n_out, self.face)
-        joined = [
-            np.concatenate([np.array(a), np.array(b)[..., chosen]], axis=-1)
-            for a, b in zip(old, (at.p, at.n, at.n_out, at.face))
-        ]
-        p, n, n_out = (of_rows(type(a), values.T) for a, values in zip(old, joined[:3]))
-        face = aligned(mi.UInt32, joined[3])
-        return SurfacePoints(p, n, n_out, face, *_grid(np.array(p).T, self.h))
 
     def some(self, kept: np.ndarray) -> SurfacePoints:
         """Those of these numbers."""
@@ -243,6 +215,40 @@ class SurfacePoints:
         loop = (mi.UInt32(begin), mi.Float(0), state)
         out = dr.while_loop(loop, lambda i, *_: i < end, step, label="points in reach")
         return out[1], out[2]
+
+
+def _apart(p: np.ndarray, n: np.ndarray, r: float) -> np.ndarray:
+    """Numbers of places (m, 3) in random order of which no two that face the same way are closer than r, and each other
+    place has one that near: those of larger distances first."""
+    # ---- distances 2^k r, each by 4^k times fewer places, so that all have as many in reach
+    chosen = np.zeros(0, dtype=int)
+    for k in range(max(int(np.log2(len(p) / COARSEST) / 2), 0), -1, -1):
+        m, reach = len(p) // 4**k, r * 2**k
+        left, tree = np.ones(m, dtype=bool), cKDTree(p[:m])
+        left[chosen] = False
+        near = cKDTree(p[chosen]).sparse_distance_matrix(tree, reach, output_type="coo_matrix")
+        left[_facing(n, chosen, *near.coords)[1]] = False
+
+        # ---- of those left each that comes before all in its reach, again until none is left
+        a, b = _facing(n, np.arange(m), *tree.query_pairs(reach, output_type="ndarray").T)
+        found = [chosen[:0]]
+        while left.any():
+            near = left[a] & left[b]
+            a, b = a[near], b[near]
+            later = np.zeros(m, dtype=bool)
+            later[np.maximum(a, b)] = True
+            first = left & ~later
+            found.append(np.flatnonzero(first))
+            left &= ~first
+            left[b[first[a]]], left[a[first[b]]] = False, False
+        chosen = np.concatenate([chosen, np.sort(np.concatenate(found))])
+    return chosen
+
+
+def _facing(n: np.ndarray, of: np.ndarray, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Those of the pairs of[a], b whose normals n face the same way."""
+    same = (n[of[a]] * n[b]).sum(axis=1) > 0
+    return of[a][same], b[same]
 
 
 def _grid(p: np.ndarray, h: float) -> tuple[float, np.ndarray, np.ndarray, mi.UInt32, mi.UInt32]:

@@ -13,11 +13,12 @@ weights W_cj. Before the levels, all residuals are fitted by (1, G) times the po
 models err alike everywhere. Level 0 is one fit of all points, each further level has four times as many centres as the
 one before and fits what the coarser ones leave. C is the first fit Z and what each level adds,
 
-    C = Z + Σ_l kappa_l d^(l),    kappa_l = S[d_1 d_2] / S[(d_1 + d_2)² / 4],
+    C = Z + Σ_l kappa_l d^(l),    kappa_l = (S[d_1 d_2] - DOUBT S[(d_1 - d_2)² / 4]) / S[(d_1 + d_2)² / 4],
 
 d_1 and d_2 of two independent halves of the residuals, S a mean over the neighbourhood: the Wiener filter, as
-E[d_1 d_2] is the square of the field alone. The mean over directions and what d has beyond it have a kappa each. So
-finer levels come in as residuals become many. The mean squared error
+E[d_1 d_2] is the square of the field alone, less a part of the noise that is left in S. The mean over
+directions and what d has beyond it have a kappa each. So finer levels come in as residuals become many. The mean
+squared error
 
     ((1 - kappa)² + 2) S[d_1 d_2] of the finest level + (C_1 - C_2)² / 4
 
@@ -40,6 +41,7 @@ RIDGE = 0.001  # of the sum of weights, on all but the constant; features are of
 NOISE = 20.0  # more of it for each residual: their variance over that of coefficients
 TERMS, ZONAL = 12, 3  # of `directional`, and the last of them, which are of the cosine alone
 LEAST_OF_LEVEL = 24  # residuals for each centre of a level, on average
+DOUBT = 0.3  # of the noise: that much of it may be left in S[d_1 d_2], a mean over few centres
 FINER = 2.0  # power of detail that no level has, over that of the finest level
 
 
@@ -109,7 +111,7 @@ class Level:
 
     @classmethod
     def of(cls, p: np.ndarray, n: np.ndarray, area: float, count: int) -> Level:
-        """The first `count` points as centres: the points are a low-discrepancy sequence."""
+        """The first `count` points as centres: the first of all are as far apart as so many can be."""
         h = REACH * float(np.sqrt(area / count))
         d = cKDTree(p[:count]).sparse_distance_matrix(cKDTree(p), h, output_type="coo_matrix")
         c, j = d.coords
@@ -226,7 +228,8 @@ def smooth_field(
         wide, mean = of[max(k - 2, 0)], 0.5 * (d[0] + d[1])
         signal = [np.maximum(wide.averaged(v), 0) for v in directions.powers(*d)]
         power = [wide.averaged(v) for v in directions.powers(mean, mean)]
-        kappa = [np.minimum(s / np.maximum(v, 1e-30), 1) for s, v in zip(signal, power)]
+        doubt = [DOUBT * np.maximum(v - s, 0) for s, v in zip(signal, power)]
+        kappa = [np.clip((s - x) / np.maximum(v, 1e-30), 0, 1) for s, v, x in zip(signal, power, doubt)]
         d = [directions.scaled(more, kappa) for more in d]
         lost = sum(((1 - x) ** 2 + FINER) * s for x, s in zip(kappa, signal))
         C = [C_half + more for C_half, more in zip(C, d)]

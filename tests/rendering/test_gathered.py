@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from full_geometry.geometry.light_points import SurfacePoints, uniform_entries
 from full_geometry.geometry.shape import analyse_shape
@@ -271,19 +272,21 @@ def test_s_leans_towards_the_other_end_by_a_network_and_not_by_a_dipole() -> Non
     assert (by_network[1:, :, 1] < -0.25).all()
 
 
-@pytest.mark.slow
-def test_every_place_of_a_surface_in_rows_of_faces_has_a_point_in_reach() -> None:
-    # of the set of points alone 6 and 13 % had none, and were black
+def test_points_of_a_surface_in_rows_of_faces_are_even() -> None:
+    # a lattice of faces and places on them left lines of points and gaps, which were streaks of light
     def even_box(p: np.ndarray) -> np.ndarray:
         return box(p, np.array([1.0, 0.7, 1.0]), 0.25)
 
     geometry = analyse_shape(surface(even_box, Box((-1.1, -0.8, -1.1), (1.1, 0.8, 1.1)), 96).mitsuba("box"))
-    u = np.random.default_rng(5).random((3, 200_000)).astype(np.float32)
+    u = np.random.default_rng(5).random((3, 2000)).astype(np.float32)
     at = uniform_entries(geometry, mi.Float(u[0]), mi.Point2f(u[1:]))
     for count in (512, 2048):
         points = SurfacePoints.of(geometry, count)
-        assert count < len(points) < 1.15 * count
-        assert np.mean(~np.array(points.nearest(at.p, at.n, mi.Bool(True))[1])) < 1e-4
+        assert len(points) == pytest.approx(count, rel=0.05)
+        reach = 1.5 * np.sqrt(geometry.area / len(points))
+        near = [len(found) for found in cKDTree(np.array(points.p).T).query_ball_point(np.array(at.p).T, reach)]
+        assert np.std(near) < 0.25 * np.mean(near)  # .4 by chance
+        assert min(near) >= 2
 
 
 def test_derivatives_are_refused() -> None:
