@@ -20,7 +20,7 @@ E[d_1 d_2] is the square of the field alone, less a part of the noise that is le
 directions and what d has beyond it have a kappa each. So finer levels come in as residuals become many. The mean
 squared error
 
-    ((1 - kappa)² + 2) S[d_1 d_2] of the finest level + (C_1 - C_2)² / 4
+    ((1 - kappa)² + 1) S[d_1 d_2] of the finest level + (C_1 - C_2)² / 4
 
 is what the filter takes away, finer detail as if each further level had half the power of the one before, and the
 noise of the mean of C_1 and C_2. Moon et al. (2014) and Bitterli et al. (2016) regress so over pixels.
@@ -42,7 +42,7 @@ NOISE = 20.0  # more of it for each residual: their variance over that of coeffi
 TERMS, ZONAL = 12, 3  # of `directional`, and the last of them, which are of the cosine alone
 LEAST_OF_LEVEL = 24  # residuals for each centre of a level, on average
 DOUBT = 0.3  # of the noise: that much of it may be left in S[d_1 d_2], a mean over few centres
-FINER = 2.0  # power of detail that no level has, over that of the finest level
+FINER = 1.0  # power of detail that no level has, over that of the finest level
 
 
 def directional(x: Any, y: Any, z: Any, mu: Any) -> list[Any]:
@@ -226,12 +226,12 @@ def smooth_field(
         left = [replace(half, r=half.r - half.a @ C_half) for half, C_half in zip(halves, C)]
         d = [level.fitted(features, half) for half in left]
         wide, mean = of[max(k - 2, 0)], 0.5 * (d[0] + d[1])
-        signal = [np.maximum(wide.averaged(v), 0) for v in directions.powers(*d)]
+        signal = [wide.averaged(v) for v in directions.powers(*d)]
         power = [wide.averaged(v) for v in directions.powers(mean, mean)]
-        doubt = [DOUBT * np.maximum(v - s, 0) for s, v in zip(signal, power)]
+        doubt = [DOUBT * np.maximum(v - np.maximum(s, 0), 0) for s, v in zip(signal, power)]
         kappa = [np.clip((s - x) / np.maximum(v, 1e-30), 0, 1) for s, v, x in zip(signal, power, doubt)]
         d = [directions.scaled(more, kappa) for more in d]
-        lost = sum(((1 - x) ** 2 + FINER) * s for x, s in zip(kappa, signal))
+        lost = sum(((1 - x) ** 2 + FINER) * s for x, s in zip(kappa, signal))  # S < 0 too: the mean has no bias then
         C = [C_half + more for C_half, more in zip(C, d)]
 
     # ---- squared error: what the filter loses, finer detail, and the noise of the mean of both halves
