@@ -29,7 +29,7 @@ MODEL = "neural"
 SCENES = ("candle", "fruit", "head", "ice", "jelly", "leaf", "milk", "soap", "statue", "toy")
 ACROSS = 5  # scenes in a row of the picture
 SIZES = {"draft": 96, "paper": 384}
-MODEL_SPP = {"draft": 16, "paper": 32}
+MODEL_SPP = {"draft": 16, "paper": 64}
 TRUTH_SPP = {"draft": 64, "paper": 128}
 NOTES = (
     "Corrected light has the time of its walks in its seconds; FLIP and relative squared error are of the pixels with "
