@@ -231,10 +231,11 @@ def smooth_field(
         doubt = [DOUBT * np.maximum(v - np.maximum(s, 0), 0) for s, v in zip(signal, power)]
         kappa = [np.clip((s - x) / np.maximum(v, 1e-30), 0, 1) for s, v, x in zip(signal, power, doubt)]
         d = [directions.scaled(more, kappa) for more in d]
-        lost = sum(((1 - x) ** 2 + FINER) * s for x, s in zip(kappa, signal))  # S < 0 too: the mean has no bias then
+        lost = sum(((1 - x) ** 2 + FINER) * s for x, s in zip(kappa, signal))
         C = [C_half + more for C_half, more in zip(C, d)]
 
     # ---- squared error: what the filter loses, finer detail, and the noise of the mean of both halves
+    lost -= min(float(lost.mean()), 0)  # S < 0 counts, for its mean to have no bias, as far as that is positive
     apart, result = C[0] - C[1], 0.5 * (C[0] + C[1])
     error = lost + 0.25 * np.maximum(sum(directions.powers(apart, apart)), 0)
     return np.moveaxis(result, 1, 2), directions.mean(result), error
