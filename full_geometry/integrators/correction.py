@@ -226,7 +226,9 @@ class Corrections:
             gathered = [by_shape.get(id(each.shape)) for each in media.objects]
         if not same_objects(gathered, self._gathered):
             self._gathered, self._known, walk.outgoing = gathered, [None] * len(gathered), None
-            self._lights = [g and replace(g, rough=let_in(media, k)) for k, g in enumerate(gathered)]
+            rough = [let_in(boundary, spec.medium.eta) for boundary, spec in zip(media.boundaries, media.specs)]
+            kinds = media.instance_table.kind
+            self._lights = [g and replace(g, rough=rough[kind]) for g, kind in zip(gathered, kinds)]
         if not samples and not alone:
             return walk if walk.outgoing is not None else None
 
@@ -342,9 +344,8 @@ def _check(obj: TranslucentObject, settings: Settings, alone: bool) -> None:
         raise ValueError(f"light of object {obj.geometry.name} must be sampled, got corrected: {reason}")
 
 
-def let_in(media: WalkMedia, k: int) -> mi.Texture1f | None:
-    """The share of light that the boundary of object k lets in, by the cosine of its direction, if it is rough."""
-    boundary, eta = media.boundaries[int(media.instance_table.kind[k])], float(media.row("eta", mi.Int32(k))[0])
+def let_in(boundary: mi.BSDF, eta: float) -> mi.Texture1f | None:
+    """The share of light that a boundary of this index lets in, by the cosine of its direction, if it is rough."""
     if not is_rough(boundary):
         return None
     # eta² times the mean weight of refracted directions
