@@ -12,6 +12,7 @@ from benchmarks.shapes_command import shapes_command
 from benchmarks.speeds_command import gathered_command, speeds_command
 from benchmarks.total_error_command import time_to_error_command, total_error_command
 from benchmarks.trade_check_command import check_command
+from benchmarks.training_commands import train_shapes_command, train_universal_command
 from figures.parts.command import COMMANDS as FIGURES
 from halfspace_sss.cli.shared import Commands, add, group
 
@@ -31,9 +32,11 @@ COMMANDS = {
     "time-to-error": time_to_error_command,
     "total-error": total_error_command,
     "trade-check": check_command,
+    "train-shapes": train_shapes_command,
+    "train-universal": train_universal_command,
 }
 
-app = group("Compare choices and rivals of the models: tables for the docs.", cls=Commands)
+app = group("Compare choices and rivals of the models, and train the networks of the package.", cls=Commands)
 for name, function in COMMANDS.items():
     add(app, name, function)
 inner = group("Compute and draw figures, those of the benchmarks too.")

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from full_geometry.learning.meshes import Box, Distance, box, capsule, join, margin, overlap, twisted
-
-Made = tuple[Distance, Box]
+from benchmarks.random_shapes import Made, box, margin
+from figures.modelling.meshes import capsule, join, overlap, twisted
 
 
 def hand() -> Made:

@@ -10,20 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.random_shapes import Made, margin
+from figures.modelling.meshes import Box, Mesh, capsule, cut, ellipsoid, join, overlap, smoothstep, surface
 from figures.parts.part import SceneDict
-from full_geometry.learning.meshes import (
-    Box,
-    Distance,
-    Mesh,
-    capsule,
-    cut,
-    ellipsoid,
-    join,
-    margin,
-    overlap,
-    smoothstep,
-    surface,
-)
 
 BOX = Box((-1.3, -2.1, -1.5), (1.3, 1.6, 1.6))
 TEXELS = 512  # around and along the height
@@ -125,9 +114,6 @@ def write_painted(mesh: Mesh, path: Path) -> SceneDict:
     texels = np.ascontiguousarray(paint(), dtype=np.float32)
     texture = {"type": "bitmap", "bitmap": mi.Bitmap(texels), "raw": True}
     return {"shape": {"type": "ply", "filename": str(path)}, "paint": texture}
-
-
-Made = tuple[Distance, Box]
 
 
 def leaves(rng: np.random.Generator) -> Made:

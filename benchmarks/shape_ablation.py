@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from benchmarks.held_out import HELD_OUT
-from full_geometry.learning.shape_training import (
+from benchmarks.shape_training import (
     STANDARD,
     PairData,
     ShapeFit,
@@ -83,7 +83,7 @@ def _objects(work: Path) -> list[PairData]:
             if "walks" in stored:
                 objects.append(PairData.from_arrays(stored))
     if not objects:
-        raise ValueError(f"work must hold objects of `train shapes`, got none in {work}")
+        raise ValueError(f"work must hold objects of `train-shapes`, got none in {work}")
     return objects
 
 

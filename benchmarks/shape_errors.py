@@ -14,9 +14,9 @@ import mitsuba as mi
 import numpy as np
 
 from benchmarks.held_out import HELD_OUT
+from benchmarks.shape_training import draw_object
 from figures.parts.part import SceneDict
 from full_geometry.learning.model_errors import LIGHTS, RadianceError, errors_of, transport_of
-from full_geometry.learning.shape_training import draw_object
 from full_geometry.objects.objects import TranslucentObject, object_of
 from full_geometry.transport.any_shape import transport
 from full_geometry.transport.descriptors import mean_chord

@@ -26,7 +26,7 @@ def shapes_command(
     ] = None,
     mm_per_unit: Annotated[float, typer.Option(help="Millimetres in a unit of that file.")] = MM_PER_UNIT,
     work: Annotated[
-        Path | None, typer.Option(help="Work folder of `train shapes`, to fit short ablations on its objects.")
+        Path | None, typer.Option(help="Work folder of `train-shapes`, to fit short ablations on its objects.")
     ] = None,
     seconds: Annotated[float, typer.Option(help="Processor time of each ablation.")] = 60.0,
     pictures: Annotated[Path | None, typer.Option(help="PNG file of the ten worst held-out shapes.")] = None,

@@ -25,10 +25,10 @@ from figures.computing.learnt import object_parts
 from figures.computing.scans import SCANS, prepare, scan_scene, surroundings
 from figures.computing.timed import TimedRender, alternating, rendered
 from figures.fig01 import VIEWS
+from figures.modelling.meshes import surface
 from figures.modelling.objects import MODELS as VARYING
 from figures.modelling.objects import tissue
 from figures.parts.part import Row, SceneDict
-from full_geometry.learning.meshes import surface
 from full_geometry.trade.denoising import cover
 from halfspace_sss import materials
 from halfspace_sss.neural.store import weights_in

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from benchmarks.head_and_leaf import LEAVES
+from benchmarks.random_shapes import TRAINING, make_shape
 from benchmarks.things import Staging, against_walks, lit_scene, shown, thing_parts, walked
 from figures.computing.contenders import NOTE
 from figures.computing.learnt import weight_files
 from figures.computing.scans import DRAGON, SCANS
 from figures.drawing.image_grid import image_files, rows_of
 from figures.parts.part import Part, Result, SceneDict, Task
-from full_geometry.learning.meshes import TRAINING, make_shape
 from halfspace_sss import materials
 from halfspace_sss.provenance import check_folder
 

@@ -17,12 +17,12 @@ from figures.parts.command import COMMANDS as FIGURES
 from full_geometry.cli.fit import fit
 from full_geometry.cli.render import render, view
 from full_geometry.cli.trade import trade
-from full_geometry.cli.train import errors_object, train_object, train_shapes
+from full_geometry.cli.train import errors_object, train_object
 from full_geometry.cli.variants import Drawers
 from halfspace_sss.cli.curves import curves, materials_import, materials_list, materials_show, models
 from halfspace_sss.cli.errors import errors_materials, errors_truths, validate
 from halfspace_sss.cli.shared import Commands, add, group
-from halfspace_sss.cli.train import maps, train_material, train_universal
+from halfspace_sss.cli.train import maps, train_material
 from halfspace_sss.extensions import COMMANDS, FAILURES, commands, warn_left_out
 from halfspace_sss.lazy import LazyModule
 
@@ -35,7 +35,7 @@ GROUPS: Mapping[str, tuple[str, Mapping[str, Callable]]] = {
     ),
     "train": (
         "Train networks on path tracing; models find their weights by medium and object.",
-        {"material": train_material, "universal": train_universal, "object": train_object, "shapes": train_shapes},
+        {"material": train_material, "object": train_object},
     ),
     "errors": (
         "Measure errors of models against path tracing and published values.",

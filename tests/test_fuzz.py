@@ -32,13 +32,12 @@ HOW = {"deadline": None, "derandomize": CASES == 0, "database": None, "suppress_
 COMPUTES = [  # what is replaced: the properties are of what comes before the computation
     "halfspace_sss.comparison.reflectance_curves.trace_curve", "halfspace_sss.maps.map_store.trace_unit",
     "halfspace_sss.comparison.model_errors.references", "halfspace_sss.neural.train",
-    "halfspace_sss.neural.training.train_universal.train_universal",
     "halfspace_sss.comparison.truths.validate", "halfspace_sss.comparison.model_truths.reflectance_truths",
     "full_geometry.scenes.reference.render",
     "figures.parts.runner.completed_plans",
     "full_geometry.trade.advice.references", "full_geometry.trade.assessing.assess_stage",
     "full_geometry.trade.assessing.assess_for",
-    "full_geometry.learning.shape_training._ShapeTraining", "full_geometry.learning.training._ObjectTraining",
+    "full_geometry.learning.training._ObjectTraining",
     "full_geometry.learning.learners.errors_of", "full_geometry.inverse.fitting.MediumDescent",
 ]  # fmt: skip
 ODD = ["", " ", "nan", "inf", "-inf", "-1", "0", "1", "2", "0.5", "1e6", "1e400", "1,2", "0,", "1/2", "2/1", "marble",
@@ -85,7 +84,6 @@ WRITING = [name for name in COMMANDS if not name.startswith(("materials", "model
 @pytest.mark.parametrize("command", WRITING)
 def test_nothing_at_the_command_line_ends_in_a_traceback(command: str, tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.chdir(tmp_path)
-    importlib.import_module("halfspace_sss.neural.training.train_universal")  # its package has a function of that name
     for place in COMPUTES:
         module, _, attribute = place.rpartition(".")
         monkeypatch.setattr(place, _refused_in(tmp_path, getattr(importlib.import_module(module), attribute)))

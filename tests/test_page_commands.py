@@ -52,9 +52,7 @@ LESS = {  # what a command is given beside, by the longest of these that it star
     "figures draw": "--quality draft",
 }
 UNDERSTOOD = {  # by their beginnings, why
-    "train universal": "half an hour",
     "train material fig10 --model neural_paper": "minutes for its maps",
-    "train shapes": "an hour",
     "fit object.xml": "photographs",
     "render scene.glb": "a file that Blender writes: tests/rendering/test_gltf.py renders one",
     "figures all --quality draft": "15 minutes",

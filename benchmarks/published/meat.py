@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from figures.fig01 import VIEWS, View
+from figures.modelling.meshes import Box, cells, fbm, length, noise, overlap, rotated, smoothstep
 from figures.modelling.objects import MODELS
-from full_geometry.learning.meshes import Box, cells, fbm, length, noise, overlap, rotated, smoothstep
 
 MEAT_BOX = Box((-46.0, -1.5, -35.0), (46.0, 24.0, 35.0))
 HALF_LENGTH, HALF_WIDTH, THICKNESS = 41.0, 29.0, 20.0

@@ -14,8 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from figures.modelling import varying
-from figures.parts.part import SceneDict
-from full_geometry.learning.meshes import (
+from figures.modelling.meshes import (
     Box,
     Mesh,
     capsule,
@@ -30,6 +29,7 @@ from full_geometry.learning.meshes import (
     smoothstep,
     surface,
 )
+from figures.parts.part import SceneDict
 from halfspace_sss.checks import check_choice
 from halfspace_sss.materials.files import parse
 from halfspace_sss.materials.material import Material

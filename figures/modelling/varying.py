@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from full_geometry.learning.meshes import (
+from figures.modelling.meshes import (
     Box,
     cells,
     cut,

@@ -1,9 +1,8 @@
-"""The commands `train object`, `train shapes` and `errors object`: networks of an object or all shapes, and errors."""
+"""The commands `train object` and `errors object`: networks of an object, and errors of models of it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,15 +11,13 @@ import typer
 from full_geometry.cli.variants import SceneOptions, use_mitsuba
 from halfspace_sss.cli import shared
 from halfspace_sss.cli.errors import write_errors
-from halfspace_sss.cli.train import ResultOptions, Work, need_torch
+from halfspace_sss.cli.train import ResultOptions, need_torch
 from halfspace_sss.provenance import check_folder
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from full_geometry.learning.learners import LearntObject, ObjectError
-
-Seconds = Annotated[float, typer.Option(help="Seconds for data and fit, without compilation.")]
 
 
 def train_object(
@@ -32,7 +29,7 @@ def train_object(
         list[str] | None,
         typer.Option(help="Id of the object in the scene; repeat for more.", show_default="the only translucent one"),
     ] = None,
-    seconds: Seconds = 60.0,
+    seconds: Annotated[float, typer.Option(help="Seconds for data and fit, without compilation.")] = 60.0,
     model: Annotated[
         str | None, typer.Option(help="Name of a model that learns objects.", show_default="full_geometry")
     ] = None,
@@ -85,28 +82,6 @@ def _report(learnt: LearntObject) -> None:
         return
     shared.say(object_table(learnt.errors), DEFINITION, f"{learnt.steps} steps in {learnt.seconds:.0f} s; written:")
     shared.say_files([learnt.path])
-
-
-def train_shapes(
-    mesh: Annotated[
-        list[Path] | None, typer.Option(help="Closed PLY file to draw shapes from, too; repeat for more.")
-    ] = None,
-    seconds: Seconds = 600.0,
-    seed: shared.Seed = 0,
-    out: shared.OutFolder = Path("shapes"),
-    work: Work = None,
-) -> None:
-    """Train the network for all shapes and media on random objects until the time is over."""
-    need_torch()
-    if find_spec("igl") is None:
-        raise ValueError("training on shapes needs libigl: `pip install halfspace-sss[train]`")
-    use_mitsuba("llvm_ad_mono")
-    from full_geometry.learning.shape_training import train_shapes
-
-    with shared.Bar("shapes") as bar:
-        result = train_shapes(out, seconds=seconds, seed=seed, meshes=mesh or [], work=work, progress=bar.told)
-    shared.say(f"{result.objects} objects, {result.steps} steps in {result.seconds:.0f} s; written:")
-    shared.say_files([result.path])
 
 
 # --------------------------------------------------------------------------------------------------

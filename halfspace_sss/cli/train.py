@@ -1,4 +1,4 @@
-"""The commands `maps`, `train material` and `train universal`: traced maps of media, and networks trained on them."""
+"""The commands `maps` and `train material`: traced maps of media, and networks trained on them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from halfspace_sss.maps.grid import MapGrid
-    from halfspace_sss.neural.training.train_material import MaterialRecipe, TrainedChannel
-    from halfspace_sss.neural.training.train_universal import UniversalRecipe
+    from halfspace_sss.neural.training.train_material import TrainedChannel
     from halfspace_sss.physics.medium import Medium
 
 TARGET_ERROR = 0.05
@@ -107,14 +106,6 @@ def _table(stores: dict[str, Path]) -> Table:
     return shared.table(["store", "channels", "maps", "mean cell error", "walks", "seconds"], rows)
 
 
-Recipe = TypeVar("Recipe", "MaterialRecipe", "UniversalRecipe")
-Steps = Annotated[
-    int | None, typer.Option(help="Steps of the optimiser.", parser=shared.whole, show_default="from the recipe")
-]
-
-Work = Annotated[Path | None, typer.Option(help="Folder for unfinished work, which an interrupted run continues.")]
-
-
 @dataclass(frozen=True)
 class ResultOptions:
     """Where a training leaves weights and what it goes on with, and when they are good enough."""
@@ -126,7 +117,9 @@ class ResultOptions:
     out: Annotated[Path | None, typer.Option(help="Folder for the weights.", show_default="where models find them")] = (
         None
     )
-    work: Work = None
+    work: Annotated[
+        Path | None, typer.Option(help="Folder for unfinished work, which an interrupted run continues.")
+    ] = None
 
     def elsewhere(self) -> ResultOptions:
         """With folders that processes elsewhere find."""
@@ -148,7 +141,9 @@ class RecipeOptions:
         "neural_material"
     )
     fast: Annotated[bool, typer.Option("--fast", help="A quarter of the time, about twice the error.")] = False
-    steps: Steps = None
+    steps: Annotated[
+        int | None, typer.Option(help="Steps of the optimiser.", parser=shared.whole, show_default="from the recipe")
+    ] = None
     backend: shared.Backend = "llvm"
 
 
@@ -162,11 +157,15 @@ def train_material(
 ) -> None:
     """Train networks of media: one for each channel of the materials, or for the given coefficients."""
     need_torch()
+    from halfspace_sss.checks import check_count
     from halfspace_sss.executors import completed
     from halfspace_sss.neural.training.train_material import FAST, STANDARD
 
     media = stated.media(material or [], channel)
-    recipe = _of_steps(FAST if wanted.fast else STANDARD, wanted.steps)
+    recipe = FAST if wanted.fast else STANDARD
+    if wanted.steps is not None:
+        check_count("steps", wanted.steps, 1)
+        recipe = replace(recipe, how=replace(recipe.how, steps=wanted.steps))
     rows: dict[str, list[TrainedChannel]] = {}
     with places.executor() as executor, shared.Bar("training") as bar:
         results = results.elsewhere() if executor else results
@@ -178,33 +177,6 @@ def train_material(
             if executor:
                 bar.show(len(rows), len(parts), name)
     _report([(name, each) for name in parts for each in rows[name]])
-
-
-def train_universal(
-    steps: Steps = None,
-    seed: shared.Seed = 0,
-    backend: shared.Backend = "llvm",
-    out: shared.OutFolder = Path("universal"),
-) -> None:
-    """Train the network for all media, in half an hour; a killed run goes on in the same folder."""
-    need_torch()
-    from halfspace_sss.neural.training.train_universal import UniversalRecipe
-    from halfspace_sss.neural.training.train_universal import train_universal as trained
-
-    recipe = _of_steps(UniversalRecipe(), steps)
-    with shared.Bar("universal") as bar:
-        path = trained(out, seed, recipe, backend=backend, progress=bar.told)
-    shared.say(f"written: {path}")
-
-
-def _of_steps(recipe: Recipe, steps: int | None) -> Recipe:
-    """A recipe with another number of steps, if one is given."""
-    from halfspace_sss.checks import check_count
-
-    if steps is None:
-        return recipe
-    check_count("steps", steps, 1)
-    return replace(recipe, how=replace(recipe.how, steps=steps))
 
 
 def _train(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import math
 from concurrent.futures import Executor
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 from types import ModuleType
 
@@ -33,8 +33,6 @@ FIRST_R = 0.02  # of min(L, mfp): smallest distance in the maps
 LEAST_ALBEDO = 1e-4  # G/albedo² of darker media is that of this one to 1e-4
 PILOT_LANES = 8  # of a group, one walk each
 WALKS_PER_LANE = 8  # at least, where there are enough for it: lanes then end at about the same time
-N_BACK = 2  # of the observations look back along the incident ray, where that is asked for
-BACK = (-3.0, math.log10(0.3))  # exponents of their distance from it
 
 
 @dataclass(frozen=True)
@@ -85,24 +83,6 @@ def draw_directions(albedo: np.ndarray, g: np.ndarray, eta: np.ndarray, rng: np.
     u = (strata + rng.random((2, n, GROUP))) / GROUP
     mu_o = lowest[:, None] + (1 - lowest[:, None]) * u[0]
     return Groups(albedo, g, eta, mu_i, mu_o, 2 * math.pi * u[1] - math.pi)
-
-
-def looking_back(groups: Groups, rng: np.random.Generator) -> Groups:
-    """The same groups with two directions of observation near that from which the light comes.
-
-    There the refracted rays lie close to each other and the features of a pair change fastest, and there are all curves
-    of normal incidence and exit; uniform directions hardly ever fall there. The distance from w_i is 0.001 to 0.3.
-    """
-    n = (len(groups), N_BACK)
-    off = rng.standard_normal((3, *n))
-    off *= 10 ** rng.uniform(*BACK, n) / np.linalg.norm(off, axis=0)
-    mu_i = groups.mu_i[:, None]
-    x, y, z = off[0] - np.sqrt(1 - mu_i**2), off[1], off[2] + mu_i
-    lowest = np.sqrt(np.maximum(1 - groups.eta**2, 0.0))[:, None]
-    mu_o, delta_phi = groups.mu_o.copy(), groups.delta_phi.copy()
-    mu_o[:, -N_BACK:] = np.clip(np.abs(z) / np.sqrt(x * x + y * y + z * z), lowest, 1.0)
-    delta_phi[:, -N_BACK:] = np.arctan2(y, x)
-    return replace(groups, mu_o=mu_o, delta_phi=delta_phi)
 
 
 def radial_edges(groups: Groups, grid: CellGrid) -> np.ndarray:

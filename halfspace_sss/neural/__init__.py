@@ -21,14 +21,12 @@ from halfspace_sss.neural.universal import Neural
 
 if TYPE_CHECKING:
     from halfspace_sss.neural.training.train_material import train
-    from halfspace_sss.neural.training.train_universal import train_universal
 
-__all__ = ["MODELS", "Neural", "NeuralMaterial", "NeuralPaper", "train", "train_universal"]
+__all__ = ["MODELS", "Neural", "NeuralMaterial", "NeuralPaper", "train"]
 
 MODELS: list[type[BSSRDF]] = [Neural, NeuralMaterial, NeuralPaper]
 
-TRAININGS = {"training.train_material": ["train"], "training.train_universal": ["train_universal"]}
-_found, __dir__ = lazy_names(__name__, TRAININGS)
+_found, __dir__ = lazy_names(__name__, {"training.train_material": ["train"]})
 
 
 def __getattr__(name: str) -> object:

@@ -100,11 +100,6 @@ class Hypernetwork:
         return layer_shapes(N_FEATURES, self.width, self.depth)
 
 
-def named_layers(name: str, layers: Layers) -> dict[str, np.ndarray]:
-    """Matrices and biases by name, for the file of weights."""
-    return {f"{name}_{k}_{n}": v for k, pair in enumerate(layers) for n, v in zip("Wb", pair)}
-
-
 def _layered(layers: Layers, albedo: Real, g: Real, eta: float) -> Real:
     lib = library(albedo)
     albedo, g, eta, L = (lib.like(v, albedo) for v in (albedo, g, eta, length_scale(albedo, g)))

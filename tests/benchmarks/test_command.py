@@ -26,6 +26,8 @@ WRONG = {
     "time-to-error": ["--blocks", "0"],
     "total-error": ["--object", "marbel"],
     "trade-check": ["--scenes", "-1"],
+    "train-shapes": ["--seconds", "0"],
+    "train-universal": ["--steps", "0"],
 }
 
 

@@ -11,7 +11,7 @@ from benchmarks.gathered_error import off  # noqa: E402
 from benchmarks.hand_and_ribbon import SHAPES  # noqa: E402
 from benchmarks.speeds import PASSES, LitObject, Measuring, _noise, ways_of  # noqa: E402
 from figures.computing.timed import TimedRender  # noqa: E402
-from full_geometry.learning.meshes import surface  # noqa: E402
+from figures.modelling.meshes import surface  # noqa: E402
 
 
 def test_noise_holds_light_that_most_pixels_have_not_met() -> None:

@@ -11,6 +11,9 @@ import pandas
 import pytest
 from typer.testing import CliRunner
 
+from benchmarks import __main__ as benchmarks
+from benchmarks import universal_training
+from benchmarks.universal_training import UniversalRecipe
 from figures import app as cli
 from halfspace_sss import bssrdf, materials
 from halfspace_sss.comparison import model_errors
@@ -19,10 +22,9 @@ from halfspace_sss.maps.noisy_maps import CellGrid
 from halfspace_sss.materials import catalogue as registry
 from halfspace_sss.neural import material_model, paper_model, store
 from halfspace_sss.neural.store import load_weights
-from halfspace_sss.neural.training import train_material, train_universal
+from halfspace_sss.neural.training import train_material
 from halfspace_sss.neural.training.fit import Fit
 from halfspace_sss.neural.training.train_material import MaterialRecipe
-from halfspace_sss.neural.training.train_universal import UniversalRecipe
 
 FIG10 = materials.load("fig10").medium
 HOW = Fit(steps=20, n_groups=4, n_queries=32, validate_every=5)
@@ -33,7 +35,8 @@ TINY_UNIVERSAL = UniversalRecipe(
 
 
 def _invoke(*arguments: str) -> Any:
-    return CliRunner().invoke(cli.app, list(arguments))
+    app = benchmarks.app if arguments[0].startswith("train-") else cli.app
+    return CliRunner().invoke(app, list(arguments))
 
 
 def _errors(*arguments: str) -> Any:
@@ -46,7 +49,7 @@ def _small(monkeypatch: Any, tmp_path: Path) -> None:
     monkeypatch.setattr(model_errors, "GRID", CellGrid(16, 8))
     for name in ("STANDARD", "FAST"):
         monkeypatch.setattr(train_material, name, TINY)
-    monkeypatch.setattr(train_universal, "UniversalRecipe", lambda: TINY_UNIVERSAL)
+    monkeypatch.setattr(universal_training, "UniversalRecipe", lambda: TINY_UNIVERSAL)
     for module in (material_model, paper_model):
         monkeypatch.setattr(module, "find_weights", store.find_weights)
     monkeypatch.setenv(store.ENVIRONMENT_VARIABLE, str(tmp_path / "weights"))
@@ -113,7 +116,7 @@ def test_the_name_of_a_material_cannot_lead_out_of_the_work_folder(
 
 @pytest.mark.slow
 def test_the_universal_network_is_trained_into_a_folder() -> None:
-    result = _invoke("train", "universal", "--steps", "3", "--out", "all")
+    result = _invoke("train-universal", "--steps", "3", "--out", "all")
     assert result.exit_code == 0 and "neural.safetensors" in result.stdout
     assert load_weights(Path("all") / "neural.safetensors", "neural")[1]["recipe"]["how"]["steps"] == 3
 
@@ -153,7 +156,7 @@ REFUSED_BY_ERRORS = [
 ]
 REFUSED = [
     *(("train material", *case) for case in REFUSED_BY_TRAIN),
-    *(("train universal", *case) for case in REFUSED_BY_UNIVERSAL),
+    *(("train-universal", *case) for case in REFUSED_BY_UNIVERSAL),
     *(("errors materials", *case) for case in REFUSED_BY_ERRORS),
 ]
 

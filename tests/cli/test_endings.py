@@ -35,8 +35,6 @@ SMALL = {  # a small run of each command, and what it refuses
     "trade": (["ball.xml", "--model", "better_dipole", "--assess", "0.05", "--out", "o"], ["marbel"]),
     "train material": (["--fast", "--steps", "20", "--out", "o", "--work", "o/work"], ["marbel"]),
     "train object": (["--scene", "ball.xml", "--out", "o"], ["--scene", "none.xml"]),
-    "train shapes": (["--out", "o"], ["--mesh", "none.ply"]),
-    "train universal": (["--out", "o"], ["--steps", "0"]),
     "validate": (["--rows", "T0134", "--quick", "--out", "o"], ["--rows", "nope"]),
     "view": (["ball.xml", "--port", "0"], ["none.xml"]),
 }
@@ -115,8 +113,6 @@ LONG = (
     "figures all",
     "fit",
     "train object",
-    "train shapes",
-    "train universal",
     "view",
 )  # minutes, or without an end
 

@@ -14,8 +14,7 @@ import mitsuba as mi  # noqa: E402
 
 from benchmarks.published import meat  # noqa: E402, F401  # an object more
 from figures.computing import scans as scenes  # noqa: E402
-from figures.modelling import objects  # noqa: E402
-from full_geometry.learning import meshes  # noqa: E402
+from figures.modelling import meshes, objects  # noqa: E402
 
 LOW, HIGH = 32, 64
 CELLS = 24

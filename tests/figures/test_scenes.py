@@ -10,7 +10,7 @@ pytest.importorskip("igl")
 
 from benchmarks import head_and_leaf as head  # noqa: E402
 from benchmarks import scenes_figure as scenes  # noqa: E402
-from full_geometry.learning.meshes import make_shape  # noqa: E402
+from benchmarks.random_shapes import make_shape  # noqa: E402
 
 
 def test_a_head_is_one_closed_surface_with_paint_in_range() -> None:

@@ -14,8 +14,8 @@ mi = pytest.importorskip("mitsuba")
 pytest.importorskip("igl")
 
 from benchmarks.held_out import HELD_OUT  # noqa: E402
+from benchmarks.random_shapes import make_shape  # noqa: E402
 from full_geometry.geometry.points import SurfacePoint, cosine_direction  # noqa: E402
-from full_geometry.learning.meshes import make_shape  # noqa: E402
 from full_geometry.learning.model_errors import errors_of  # noqa: E402
 from full_geometry.objects.objects import TranslucentObject, object_of  # noqa: E402
 from full_geometry.transport.any_shape import Backbone  # noqa: E402

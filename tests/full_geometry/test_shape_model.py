@@ -11,12 +11,9 @@ dr = pytest.importorskip("drjit")
 mi = pytest.importorskip("mitsuba")
 pytest.importorskip("igl")
 
+from benchmarks.random_shapes import make_shape  # noqa: E402
+from figures.modelling.meshes import Box, surface  # noqa: E402
 from full_geometry.geometry.points import SurfacePoint, cosine_direction  # noqa: E402
-from full_geometry.learning.meshes import (  # noqa: E402
-    Box,
-    make_shape,  # noqa: E402
-    surface,
-)
 from full_geometry.learning.model_errors import errors_of, transport_of  # noqa: E402
 from full_geometry.objects.objects import TranslucentObject, object_of  # noqa: E402
 from full_geometry.transport.any_shape import Backbone, NeuralShape, most, transport  # noqa: E402
@@ -42,7 +39,7 @@ N = 512
 def random_weights(seed: int = 0, width: int = 16) -> dict[str, np.ndarray]:
     """Numbers with which f is of order one."""
     pytest.importorskip("torch")
-    from full_geometry.learning.shape_training import ShapeNetwork, ShapeRecipe
+    from benchmarks.shape_training import ShapeNetwork, ShapeRecipe
 
     rng = np.random.default_rng(seed)
     arrays = ShapeNetwork(ShapeRecipe(width=width, depth=2), seed).arrays()
@@ -182,7 +179,7 @@ def test_a_channel_is_what_its_medium_is_alone() -> None:
 @pytest.mark.slow
 def test_torch_and_drjit_say_the_same() -> None:
     torch = pytest.importorskip("torch")
-    from full_geometry.learning.shape_training import ShapeNetwork, ShapeRecipe
+    from benchmarks.shape_training import ShapeNetwork, ShapeRecipe
 
     obj = object_of(make_shape("shells", 2, 24).mitsuba("bowl"), WAX.scaled(8.0))
     weights, (o, i) = random_weights(1), pairs(obj)

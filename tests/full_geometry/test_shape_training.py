@@ -13,11 +13,11 @@ mi = pytest.importorskip("mitsuba")
 pytest.importorskip("igl")
 torch = pytest.importorskip("torch")
 
+from benchmarks import __main__ as cli  # noqa: E402
+from benchmarks import shape_training as training  # noqa: E402
 from benchmarks.held_out import HELD_OUT  # noqa: E402
-from figures import app as cli  # noqa: E402
-from full_geometry.learning import shape_training as training  # noqa: E402
-from full_geometry.learning.meshes import TRAINING, make_shape  # noqa: E402
-from full_geometry.learning.shape_training import (  # noqa: E402
+from benchmarks.random_shapes import TRAINING, make_shape  # noqa: E402
+from benchmarks.shape_training import (  # noqa: E402
     GROUPS,
     GroupedPairs,
     PairData,
@@ -153,7 +153,7 @@ def test_the_command_writes_weights_with_their_record(tmp_path: Path, monkeypatc
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(training, "STANDARD", QUICK)
     monkeypatch.setattr(training._ShapeTraining, "_plan", lambda run, seconds, plan: (3, 4))
-    result = CliRunner().invoke(cli.app, ["train", "shapes", "--seconds", "5", "--seed", "1"])
+    result = CliRunner().invoke(cli.app, ["train-shapes", "--seconds", "5", "--seed", "1"])
     assert result.exit_code == 0, result.output
     record = json.loads(Path("shapes", WEIGHTS).with_suffix(".json").read_text(encoding="utf-8"))
     assert record["kind"] == "neural_shape" and record["steps"] == 4 and sum(record["families"].values()) <= 3
@@ -167,7 +167,7 @@ def test_the_command_writes_weights_with_their_record(tmp_path: Path, monkeypatc
     ],
 )
 def test_bad_input_meets_a_sentence(words: list[str], message: str) -> None:
-    result = CliRunner().invoke(cli.app, ["train", "shapes", *words])
+    result = CliRunner().invoke(cli.app, ["train-shapes", *words])
     assert result.exit_code == 2 and message in " ".join(result.stderr.split())
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.universal_training import looking_back
 from halfspace_sss import Medium, trace
 from halfspace_sss.comparison import model_errors as errors
 from halfspace_sss.comparison.model_errors import ReferenceSize, TracedMaps, model_error, reference_maps
@@ -20,7 +21,6 @@ from halfspace_sss.maps.noisy_maps import (
     CellGrid,
     Groups,
     draw_directions,
-    looking_back,
     make_pool,
     radial_edges,
 )

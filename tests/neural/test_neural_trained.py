@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import halfspace_sss
+from benchmarks.universal_training import UniversalRecipe, train_universal
 from halfspace_sss import Medium, materials
 from halfspace_sss.maps import noisy_maps
 from halfspace_sss.maps.noisy_maps import CellGrid
@@ -18,7 +19,6 @@ from halfspace_sss.neural import material_model, paper_model, store
 from halfspace_sss.neural.store import load_weights
 from halfspace_sss.neural.training.fit import Fit
 from halfspace_sss.neural.training.train_material import MaterialRecipe, TrainedChannel, train
-from halfspace_sss.neural.training.train_universal import UniversalRecipe, train_universal
 
 FIG10 = materials.load("fig10").medium
 HOW = Fit(steps=20, n_groups=4, n_queries=32, validate_every=5)

@@ -15,12 +15,13 @@ import pytest
 import torch
 
 import halfspace_sss
+from benchmarks.universal_training import Hyper, UniversalRecipe, train_universal
 from halfspace_sss import Medium, materials
 from halfspace_sss.comparison.model_errors import ReferenceSize, TracedMaps, model_error, reference_maps
 from halfspace_sss.maps.grid import draw_media
 from halfspace_sss.maps.noisy_maps import CellGrid, draw_directions, make_pool
 from halfspace_sss.neural.training.fit import Fit, Source, fit
-from halfspace_sss.neural.training.learners import Hyper, MapPool, PaperLearner, Small
+from halfspace_sss.neural.training.learners import MapPool, PaperLearner, Small
 from halfspace_sss.neural.training.train_material import (
     MaterialRecipe,
     MaterialTraining,
@@ -30,7 +31,6 @@ from halfspace_sss.neural.training.train_material import (
     train,
     train_channel,
 )
-from halfspace_sss.neural.training.train_universal import UniversalRecipe, train_universal
 from halfspace_sss.neural.universal import Hypernetwork
 from halfspace_sss.progress import NamedProgress
 

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from benchmarks.random_shapes import box
+from figures.modelling.meshes import Box, surface
 from full_geometry.geometry.light_points import SurfacePoints, uniform_entries
 from full_geometry.geometry.shape import analyse_shape
 from full_geometry.integrators.fine_light import FineLight, fine_light
 from full_geometry.integrators.gathering import _steadied, _stratified
-from full_geometry.learning.meshes import Box, box, surface
 from full_geometry.precomputed.entries import StratifiedEntries
 from full_geometry.precomputed.point_pairs import Rays, lit_pairs
 from full_geometry.precomputed.transport_matrix import Incident, RowUniforms

@@ -1,4 +1,4 @@
-"""What is trained: networks of one medium, also the paper's, and the network that writes those of all media.
+"""What is trained: networks of one medium, also the paper's.
 
 Their batches are random queries from a pool of noisy maps in memory.
 """
@@ -18,7 +18,6 @@ from halfspace_sss.maps.noisy_maps import CellGrid, Groups, backbone_mass, radia
 from halfspace_sss.neural.network import (
     LOG_RANGE,
     N_FEATURES,
-    N_MEDIUM,
     RELU,
     Network,
     layer_shapes,
@@ -33,7 +32,6 @@ from halfspace_sss.physics.medium import Medium
 ENERGY_SHARE = 0.5  # of the queries of a batch follow the energy over u, the others are uniform in u
 TINY = 1e-30
 FLAT, STEEP = 1e-3, 8.0  # bounds of a slope
-MEDIUM_WIDTH = 64  # hidden units of the network of a medium, which has two hidden layers
 
 
 @dataclass(frozen=True)
@@ -221,45 +219,6 @@ class Small(nn.Module):
 
     def network(self) -> Network:
         return Network.from_vector(self.numbers.detach().numpy(), self.shapes)
-
-
-class Hyper(nn.Module):
-    """log(G/B) of any medium: `Hypernetwork` as a torch module.
-    `rank`: number of coefficients of a medium. `seed`: of the numbers at the start."""
-
-    width, depth = 32, 3  # hidden layers of the small network it writes
-
-    def __init__(self, rank: int = 48, seed: int = 0) -> None:
-        super().__init__()
-        generator = torch.Generator().manual_seed(seed)
-        self.shapes: list[tuple[int, int]] = layer_shapes(N_FEATURES, self.width, self.depth)
-        sizes = [N_MEDIUM, MEDIUM_WIDTH, MEDIUM_WIDTH, rank]
-        self.matrices: nn.ParameterList = nn.ParameterList(
-            torch.randn(i, j, generator=generator) / math.sqrt(i) for i, j in zip(sizes, sizes[1:])
-        )
-        self.biases: nn.ParameterList = nn.ParameterList(0.1 * torch.randn(j, generator=generator) for j in sizes[1:])
-        self.base: nn.Parameter = nn.Parameter(initial_numbers(self.shapes, generator))
-        scale = torch.cat([torch.full((i * j + j,), 1 / math.sqrt(i)) for i, j in self.shapes])
-        self.basis: nn.Parameter = nn.Parameter(
-            0.5 / math.sqrt(rank) * scale * torch.randn(rank, len(scale), generator=generator)
-        )
-
-    def loss(self, batch: Batch) -> torch.Tensor:
-        c = batch.medium
-        for k, (W, b) in enumerate(zip(self.matrices, self.biases)):
-            c = torch.addmm(b, c, W)
-            if k < len(self.matrices) - 1:
-                c = nn.functional.silu(c)
-        log_factor = apply_networks(batch.features(), torch.addmm(self.base, c, self.basis), self.shapes)
-        return relative_loss(torch.exp(log_factor.clamp(-LOG_RANGE, LOG_RANGE)), batch)
-
-    def parameters_as_arrays(self) -> dict[str, np.ndarray]:
-        """Arrays for the file of weights, in half precision."""
-        layers = {}
-        for k, (W, b) in enumerate(zip(self.matrices, self.biases)):
-            layers |= {f"medium_{k}_W": W, f"medium_{k}_b": b}
-        arrays = {**layers, "base": self.base, "basis": self.basis}
-        return {name: value.detach().numpy().astype(np.float16) for name, value in arrays.items()}
 
 
 class PaperLearner(nn.Module):

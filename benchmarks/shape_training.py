@@ -18,8 +18,8 @@ import numpy as np
 import torch
 from torch import nn
 
+from benchmarks.random_shapes import TRAINING, Family, make_shape
 from full_geometry.geometry.points import SurfacePoint
-from full_geometry.learning.meshes import TRAINING, Family, make_shape
 from full_geometry.learning.network_fitting import DenseLayers, NamedNetwork
 from full_geometry.objects.objects import TranslucentObject, object_of
 from full_geometry.transport.any_shape import ALBEDO, ETA, KIND, LEAST, PLACE_OF_G, SIZE, WEIGHTS, Backbone, G, most

@@ -9,10 +9,11 @@ aims below R where that is close to 1, by about its error, so that no light is m
 from __future__ import annotations
 
 import io
+import math
 import os
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,13 +25,28 @@ from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.comparison.model_truths import exits
 from halfspace_sss.maps.grid import draw_media
-from halfspace_sss.maps.noisy_maps import CellGrid, draw_directions, load_maps, looking_back, make_pool
-from halfspace_sss.neural.network import N_MEDIUM, N_TERMS, calibration_terms, medium_features
+from halfspace_sss.maps.noisy_maps import CellGrid, Groups, draw_directions, load_maps, make_pool
+from halfspace_sss.neural.network import (
+    LOG_RANGE,
+    N_FEATURES,
+    N_MEDIUM,
+    N_TERMS,
+    calibration_terms,
+    layer_shapes,
+    medium_features,
+)
 from halfspace_sss.neural.store import save_weights
 from halfspace_sss.neural.training.fit import CHECKPOINT, Fit, claim, fit
-from halfspace_sss.neural.training.learners import Hyper, MapPool, torch_library
+from halfspace_sss.neural.training.learners import (
+    Batch,
+    MapPool,
+    apply_networks,
+    initial_numbers,
+    relative_loss,
+    torch_library,
+)
 from halfspace_sss.neural.training.train_material import Trial
-from halfspace_sss.neural.universal import CALIBRATION, RANGES, Hypernetwork, Layers, hypernetwork_of, named_layers
+from halfspace_sss.neural.universal import CALIBRATION, RANGES, Hypernetwork, Layers, hypernetwork_of
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.backbone import length_scale
 from halfspace_sss.physics.fresnel import mu_internal
@@ -49,6 +65,48 @@ BELOW, BRIGHT = 5e-3, 0.03  # part of R by which it is undercut where it is 1; f
 OUTLIER = 0.03  # of a logarithm, from which on it counts linearly
 WIDTH, HIDDEN = 64, 3
 CHUNK = 64  # media of a file
+N_BACK = 2  # observations of a group that look back along the incident ray
+BACK = (-3.0, math.log10(0.3))  # exponents of their distance from it
+MEDIUM_WIDTH = 64  # hidden units of the network of a medium, which has two hidden layers
+
+
+class Hyper(nn.Module):
+    """log(G/B) of any medium: `Hypernetwork` as a torch module.
+    `rank`: number of coefficients of a medium. `seed`: of the numbers at the start."""
+
+    width, depth = 32, 3  # hidden layers of the small network it writes
+
+    def __init__(self, rank: int = 48, seed: int = 0) -> None:
+        super().__init__()
+        generator = torch.Generator().manual_seed(seed)
+        self.shapes: list[tuple[int, int]] = layer_shapes(N_FEATURES, self.width, self.depth)
+        sizes = [N_MEDIUM, MEDIUM_WIDTH, MEDIUM_WIDTH, rank]
+        self.matrices: nn.ParameterList = nn.ParameterList(
+            torch.randn(i, j, generator=generator) / math.sqrt(i) for i, j in zip(sizes, sizes[1:])
+        )
+        self.biases: nn.ParameterList = nn.ParameterList(0.1 * torch.randn(j, generator=generator) for j in sizes[1:])
+        self.base: nn.Parameter = nn.Parameter(initial_numbers(self.shapes, generator))
+        scale = torch.cat([torch.full((i * j + j,), 1 / math.sqrt(i)) for i, j in self.shapes])
+        self.basis: nn.Parameter = nn.Parameter(
+            0.5 / math.sqrt(rank) * scale * torch.randn(rank, len(scale), generator=generator)
+        )
+
+    def loss(self, batch: Batch) -> torch.Tensor:
+        c = batch.medium
+        for k, (W, b) in enumerate(zip(self.matrices, self.biases)):
+            c = torch.addmm(b, c, W)
+            if k < len(self.matrices) - 1:
+                c = nn.functional.silu(c)
+        log_factor = apply_networks(batch.features(), torch.addmm(self.base, c, self.basis), self.shapes)
+        return relative_loss(torch.exp(log_factor.clamp(-LOG_RANGE, LOG_RANGE)), batch)
+
+    def parameters_as_arrays(self) -> dict[str, np.ndarray]:
+        """Arrays for the file of weights, in half precision."""
+        layers = {}
+        for k, (W, b) in enumerate(zip(self.matrices, self.biases)):
+            layers |= {f"medium_{k}_W": W, f"medium_{k}_b": b}
+        arrays = {**layers, "base": self.base, "basis": self.basis}
+        return {name: value.detach().numpy().astype(np.float16) for name, value in arrays.items()}
 
 
 class Fluxes(NamedTuple):
@@ -186,6 +244,29 @@ def calibrated(data: Fluxes, how: Fit, seed: int) -> Layers:
     learner = _Balance(seed)
     fit(learner, _batches(data, how.n_groups), how, seed)
     return learner.layers()
+
+
+def looking_back(groups: Groups, rng: np.random.Generator) -> Groups:
+    """The same groups with two directions of observation near that from which the light comes.
+
+    There the refracted rays lie close to each other and the features of a pair change fastest, and there are all curves
+    of normal incidence and exit; uniform directions hardly ever fall there. The distance from w_i is 0.001 to 0.3.
+    """
+    n = (len(groups), N_BACK)
+    off = rng.standard_normal((3, *n))
+    off *= 10 ** rng.uniform(*BACK, n) / np.linalg.norm(off, axis=0)
+    mu_i = groups.mu_i[:, None]
+    x, y, z = off[0] - np.sqrt(1 - mu_i**2), off[1], off[2] + mu_i
+    lowest = np.sqrt(np.maximum(1 - groups.eta**2, 0.0))[:, None]
+    mu_o, delta_phi = groups.mu_o.copy(), groups.delta_phi.copy()
+    mu_o[:, -N_BACK:] = np.clip(np.abs(z) / np.sqrt(x * x + y * y + z * z), lowest, 1.0)
+    delta_phi[:, -N_BACK:] = np.arctan2(y, x)
+    return replace(groups, mu_o=mu_o, delta_phi=delta_phi)
+
+
+def named_layers(name: str, layers: Layers) -> dict[str, np.ndarray]:
+    """Matrices and biases by name, for the file of weights."""
+    return {f"{name}_{k}_{n}": v for k, pair in enumerate(layers) for n, v in zip("Wb", pair)}
 
 
 @dataclass(frozen=True)
