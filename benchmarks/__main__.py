@@ -13,6 +13,7 @@ from benchmarks.speeds_command import gathered_command, speeds_command
 from benchmarks.total_error_command import time_to_error_command, total_error_command
 from benchmarks.trade_check_command import check_command
 from benchmarks.training_commands import train_shapes_command, train_universal_command
+from benchmarks.truths_commands import errors_truths, validate
 from figures.parts.command import COMMANDS as FIGURES
 from halfspace_sss.cli.shared import Commands, add, group
 
@@ -34,6 +35,8 @@ COMMANDS = {
     "trade-check": check_command,
     "train-shapes": train_shapes_command,
     "train-universal": train_universal_command,
+    "truths": errors_truths,
+    "validate": validate,
 }
 
 app = group("Compare choices and rivals of the models, and train the networks of the package.", cls=Commands)

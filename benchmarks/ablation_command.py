@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from benchmarks.kept_rows import KeptRows
 from halfspace_sss.backend import array_types
 from halfspace_sss.cli.shared import Backend, Bar, MediumOptions, OutFolder, Places, console, whole
-from halfspace_sss.provenance import JsonDict, KeptRows, check_folder, provenance, write_together
+from halfspace_sss.provenance import JsonDict, check_folder, provenance, write_together
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import numpy as np
 import typer
 
+from benchmarks.kept_rows import KeptRows
 from benchmarks.tables import markdown
 from full_geometry.cli.fit import DescentOptions, FittedOptions
 from full_geometry.cli.variants import use_mitsuba
 from halfspace_sss.checks import check_choice
 from halfspace_sss.cli.shared import Bar, OutFolder, console
-from halfspace_sss.provenance import KeptRows, check_folder, write_together
+from halfspace_sss.provenance import check_folder, write_together
 
 if TYPE_CHECKING:
     from full_geometry.inverse.views import GivenView

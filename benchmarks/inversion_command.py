@@ -10,12 +10,13 @@ from typing import Annotated
 
 import typer
 
+from benchmarks.kept_rows import KeptRows
 from benchmarks.tables import markdown
 from figures.parts.part import Row
 from full_geometry.cli.variants import use_mitsuba
 from halfspace_sss.checks import check_choice, check_count
 from halfspace_sss.cli.shared import Bar, OutFolder, console, whole
-from halfspace_sss.provenance import KeptRows, check_folder, write_together
+from halfspace_sss.provenance import check_folder, write_together
 
 TABLES = ("media", "textures", "gradients")
 

@@ -23,7 +23,7 @@ from torch import nn
 
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count, check_interval
-from halfspace_sss.comparison.model_truths import exits
+from halfspace_sss.comparison.sampled_exits import exits
 from halfspace_sss.maps.grid import draw_media
 from halfspace_sss.maps.noisy_maps import CellGrid, Groups, draw_directions, load_maps, make_pool
 from halfspace_sss.neural.network import (

@@ -20,7 +20,7 @@ from full_geometry.cli.trade import trade
 from full_geometry.cli.train import errors_object, train_object
 from full_geometry.cli.variants import Drawers
 from halfspace_sss.cli.curves import curves, materials_import, materials_list, materials_show, models
-from halfspace_sss.cli.errors import errors_materials, errors_truths, validate
+from halfspace_sss.cli.errors import errors_materials
 from halfspace_sss.cli.shared import Commands, add, group
 from halfspace_sss.cli.train import maps, train_material
 from halfspace_sss.extensions import COMMANDS, FAILURES, commands, warn_left_out
@@ -38,15 +38,14 @@ GROUPS: Mapping[str, tuple[str, Mapping[str, Callable]]] = {
         {"material": train_material, "object": train_object},
     ),
     "errors": (
-        "Measure errors of models against path tracing and published values.",
-        {"materials": errors_materials, "object": errors_object, "truths": errors_truths},
+        "Measure errors of models against path tracing.",
+        {"materials": errors_materials, "object": errors_object},
     ),
     "figures": ("Compute changed parts of the paper's figures, and draw them.", FIGURES),
 }
 SINGLE = {
     "curves": curves, "fit": fit, "maps": maps, "models": models,
-    "render": render, "trade": trade, "validate": validate,
-    "view": view,
+    "render": render, "trade": trade, "view": view,
 }  # fmt: skip
 
 

@@ -10,7 +10,6 @@ import signal
 import sys
 import warnings
 from collections.abc import Iterator
-from importlib import resources
 from pathlib import Path
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # the tests run side by side: threads of each would only get in their way
@@ -30,6 +29,7 @@ import typer.testing
 from rendered import one_thread
 
 import halfspace_sss
+from benchmarks.truths import TABLE
 from halfspace_sss import backend
 from halfspace_sss.comparison import reflectance_curves
 from halfspace_sss.materials import catalogue as registry
@@ -132,8 +132,8 @@ def speeds_are_measured_shortly() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def truths() -> list[dict[str, str]]:
-    """Rows of the packaged reference values."""
-    text = resources.files("halfspace_sss.comparison").joinpath("data/truths.csv").read_text(encoding="utf-8")
+    """Rows of the reference values."""
+    text = TABLE.read_text(encoding="utf-8")
     return list(csv.DictReader(line for line in text.splitlines() if not line.startswith("#")))
 
 

@@ -32,7 +32,6 @@ HOW = {"deadline": None, "derandomize": CASES == 0, "database": None, "suppress_
 COMPUTES = [  # what is replaced: the properties are of what comes before the computation
     "halfspace_sss.comparison.reflectance_curves.trace_curve", "halfspace_sss.maps.map_store.trace_unit",
     "halfspace_sss.comparison.model_errors.references", "halfspace_sss.neural.train",
-    "halfspace_sss.comparison.truths.validate", "halfspace_sss.comparison.model_truths.reflectance_truths",
     "full_geometry.scenes.reference.render",
     "figures.parts.runner.completed_plans",
     "full_geometry.trade.advice.references", "full_geometry.trade.assessing.assess_stage",

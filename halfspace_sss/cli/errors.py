@@ -1,11 +1,9 @@
-"""The commands `errors materials`, `errors truths` and `validate`: models and tracing against what is known."""
+"""The command `errors materials`: models against path tracing."""
 
 from __future__ import annotations
 
 import json
-import math
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -14,15 +12,10 @@ import typer
 
 from halfspace_sss.backend import array_types
 from halfspace_sss.cli import shared
-from halfspace_sss.cli.shared import Bar, Seed, csv_of, say, table
 from halfspace_sss.noise_free import NoiseFree
 from halfspace_sss.provenance import (
-    JsonDict,
-    KeptRows,
     check_folder,
     provenance,
-    without_nan,
-    write_atomically,
     write_together,
 )
 
@@ -30,7 +23,6 @@ if TYPE_CHECKING:
     import pandas
     from rich.table import Table
 
-    from halfspace_sss.comparison.truths import Comparison, Truth, Validation
     from halfspace_sss.physics.medium import Medium
 
 SQUARE = ("error_square", "error_square_standard_error")  # what a printed error is made of
@@ -102,23 +94,6 @@ def errors_materials(
     shared.say_files(files)
 
 
-def errors_truths(model: shared.Models = None, out: shared.OutFolder = Path("errors")) -> None:
-    """Compare reflectances of models with published and exact values; an interrupted run goes on."""
-    from halfspace_sss.comparison.model_truths import reflectance_truths, truth_summary
-
-    check_models(model)
-    check_folder(out)
-    kept = KeptRows(out / "truths.part", {"what": "truths"})
-    if kept:
-        shared.tell(f"goes on after {len(kept)} reflectances that were kept")
-    with shared.Bar("truths") as bar:
-        found = reflectance_truths(model or None, bar.told, kept)
-    write_atomically(out / "truths.csv", shared.csv_of(found))
-    kept.finish()
-    shared.say(_table(truth_summary(found), "relative error of the reflectance (single order included), %"))
-    shared.say_files([out / "truths.csv"])
-
-
 def _media(
     stated: shared.MediumOptions, names: list[str], channel: str | None, many: MediaOptions, seed: int
 ) -> dict[str, Medium]:
@@ -184,17 +159,17 @@ def _tables(found: pandas.DataFrame, n_media: int) -> list[Table | str]:
 
     if n_media <= 3:
         columns = ["medium", "model", "error", *SQUARE, "noise", "bias", *(c for c in found if c.startswith("r "))]
-        return [_table(found[columns], "errors, %")]
-    results: list[Table | str] = [_table(percentiles(found), "errors over the media, %")]
+        return [percent_table(found[columns], "errors, %")]
+    results: list[Table | str] = [percent_table(percentiles(found), "errors over the media, %")]
     if (found["model"] == "neural").any():
-        results.append(_table(bands(found, "neural"), "neural over ranges of media, %"))
+        results.append(percent_table(bands(found, "neural"), "neural over ranges of media, %"))
         lost = losses(found, "neural")[["medium", "error", *SQUARE, "noise", "model_best", "error_best"]]
         title = f"media on which an analytic model has a smaller error than neural: {len(lost)}"
-        results.append(_table(lost, title) if len(lost) else title)
+        results.append(percent_table(lost, title) if len(lost) else title)
     return results
 
 
-def _table(frame: pandas.DataFrame, title: str) -> Table:
+def percent_table(frame: pandas.DataFrame, title: str) -> Table:
     columns = [name for name in frame if name not in SQUARE]
     rows = [
         [told_error(row) if name == "error" and SQUARE[0] in row else _cell(row[name]) for name in columns]
@@ -215,107 +190,3 @@ def _cell(value: float | str) -> str:
     if isinstance(value, int):
         return str(value)
     return "–" if value != value else f"{100 * value:.3g}"
-
-
-KINDS = ("published", "thirdparty", "exact")
-
-
-def row_filter(text: str | None) -> Callable[[Truth], bool] | None:
-    """Choose rows by a comma-separated list of ids, measures (R_d, BRDF, ring, ...) or kinds; None chooses all.
-
-    Raises:
-        ValueError: an entry is none of these.
-    """
-    from halfspace_sss.comparison.truths import MEASURES
-
-    if not text:
-        return None
-    wanted = {part.strip() for part in text.split(",") if part.strip()}
-    known = {*MEASURES.values(), *KINDS}
-    for part in sorted(wanted - known):
-        if not (part[:1] == "T" and part[1:].isdigit()):
-            raise ValueError(f"rows must be ids such as T0134, or of {', '.join(sorted(known))}; got {part!r}")
-    return lambda truth: bool(wanted & {truth.id, truth.measure, truth.kind})
-
-
-def summary(comparisons: list[Comparison]) -> list[JsonDict]:
-    """One record per quantity: rows, largest and rms z, largest standard error relative to the traced value.
-
-    Reflectances of albedo below 0.5, whose bounds are wider, are apart.
-    """
-    groups: dict[str, list[Comparison]] = {}
-    for c in comparisons:
-        dim = c.truth.measure in ("R_d", "R_total") and c.truth.medium.albedo < 0.5
-        groups.setdefault(c.truth.quantity + (", albedo < 0.5" if dim else ""), []).append(c)
-    results = []
-    for name, group in sorted(groups.items()):
-        z = [abs(c.z) for c in group]
-        error = max(c.standard_error / abs(c.reflected) if c.reflected else math.inf for c in group)
-        about = {"quantity": name, "rows": len(group), "max_abs_z": max(z)}
-        results.append(about | {"rms_z": math.hypot(*z) / math.sqrt(len(z)), "max_relative_error": error})
-    return results
-
-
-def _record(c: Comparison) -> JsonDict:
-    """A row of the CSV and JSON files."""
-    t, m = c.truth, c.truth.medium
-    mu_o, phi = t.direction or (None, None)
-    inner, outer = t.ring or (None, None)
-    return {
-        "id": t.id, "kind": t.kind, "quantity": t.quantity, "sigma_s_per_mm": m.sigma_s, "sigma_a_per_mm": m.sigma_a,
-        "g": m.g, "eta": m.eta, "mu_i": t.mu_i, "mu_o": mu_o, "delta_phi_rad": phi, "r_inner_mm": inner,
-        "r_outer_mm": outer, "truth": t.value, "uncertainty": t.uncertainty, "traced": c.traced,
-        "standard_error": c.standard_error, "z": c.z, "n_paths": c.n_paths, "n_events": c.n_events, "seed": c.seed,
-        "source": t.source,
-    }  # fmt: skip
-
-
-def write_results(result: Validation, folder: Path) -> None:
-    """Write validate.csv (a line per row) and validate.json (rows, summary, rows not covered, provenance)."""
-    import pandas
-
-    from halfspace_sss.comparison.truths import Z_LIMIT
-
-    records = [_record(c) for c in result.comparisons]
-    content = {
-        "provenance": provenance(seed=result.seed, quick=result.quick, z_limit=Z_LIMIT),
-        "seconds": result.seconds,
-        "summary": summary(result.comparisons),
-        "failures": [c.truth.id for c in result.failures],
-        "not_covered": [vars(n) for n in result.not_covered],
-        "rows": records,
-    }
-    about = json.dumps(without_nan(content), indent=1, allow_nan=False) + "\n"
-    write_together({folder / "validate.csv": csv_of(pandas.DataFrame(records)), folder / "validate.json": about})
-
-
-def validate(
-    out: Annotated[Path | None, typer.Option(help="Folder for validate.csv and validate.json.")] = None,
-    seed: Seed = 0,
-    quick: Annotated[bool, typer.Option("--quick", help="Ten times looser standard errors.")] = False,
-    rows: Annotated[str | None, typer.Option(help="Rows to trace: ids, measures (R_d, BRDF, ...) or kinds.")] = None,
-) -> None:
-    """Trace every published, third-party or exact half-space number of the packaged table and compare."""
-    from halfspace_sss.comparison import truths
-
-    if out is not None:
-        check_folder(out)
-    with Bar("tracing") as bar:
-        result = truths.validate(row_filter(rows), seed, quick, progress=bar.show)
-    if out is not None:
-        write_results(result, out)
-    cells = [
-        (s["quantity"], f"{s['rows']}", f"{s['max_abs_z']:.2f}", f"{s['rms_z']:.2f}", f"{s['max_relative_error']:.1e}")
-        for s in summary(result.comparisons)
-    ]
-    headings = ("quantity", "rows", "max |z|", "rms z", "largest relative error")
-    say(table(headings, cells, title="traced against truths.csv"))
-    for reason, count in Counter(n.reason for n in result.not_covered).most_common():
-        say(f"not covered: {count} rows: {reason}")
-    for c in result.failures:
-        truth = f"truth {c.truth.value:.8g} ± {c.truth.uncertainty:.1e}, z = {c.z:.2f}"
-        say(f"{c.truth.id} {c.truth.quantity}: traced {c.traced:.8g} ± {c.standard_error:.1e}, {truth}")
-    verdict = f"{len(result.failures)} of {len(result.comparisons)} rows have |z| >= {truths.Z_LIMIT:g}"
-    say(f"{verdict}; {result.seconds:.0f} s")
-    if result.failures:
-        raise typer.Exit(1)

@@ -13,7 +13,7 @@ import numpy as np
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import as_count, check_count, check_interval
 from halfspace_sss.comparison.curve_set import TRACED, Curve, CurveSet
-from halfspace_sss.comparison.model_truths import sampled_reflectance
+from halfspace_sss.comparison.sampled_exits import sampled_reflectance
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.materials import Material
 from halfspace_sss.materials.catalogue import one_channel

@@ -29,6 +29,7 @@ from benchmarks.ablation import (
     summary,
 )
 from benchmarks.budgets import Samples, Seconds, Within
+from benchmarks.kept_rows import KeptRows
 from halfspace_sss import Medium, materials
 from halfspace_sss.arrays import library
 from halfspace_sss.comparison.model_errors import ReferenceSize, TracedMaps, model_error, reference_maps
@@ -39,7 +40,6 @@ from halfspace_sss.neural.training import train_material as training
 from halfspace_sss.neural.training.fit import Fit, fit
 from halfspace_sss.neural.training.learners import MapPool
 from halfspace_sss.neural.training.train_material import MaterialRecipe
-from halfspace_sss.provenance import KeptRows
 
 FIG10 = materials.load("fig10").medium
 GRID, HOW = CellGrid(8, 4), Fit(steps=1, n_groups=4, n_queries=32)

@@ -28,6 +28,8 @@ WRONG = {
     "trade-check": ["--scenes", "-1"],
     "train-shapes": ["--seconds", "0"],
     "train-universal": ["--steps", "0"],
+    "truths": ["--model", "nope"],
+    "validate": ["--rows", "nope"],
 }
 
 

@@ -236,7 +236,7 @@ def test_the_version_is_that_of_the_package() -> None:
 
 def test_help_names_every_command() -> None:
     text = _invoke("--help").stdout
-    for name in ("curves", "maps", "materials", "models", "validate"):
+    for name in ("curves", "maps", "materials", "models"):
         assert name in text
 
 

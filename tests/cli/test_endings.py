@@ -20,7 +20,6 @@ SMALL = {  # a small run of each command, and what it refuses
     "curves": (["--paths", "4096", "--theta-i", "0", "--model", "better_dipole", "--out", "o"], ["marbel"]),
     "errors materials": (["marble", "--model", "better_dipole", "--events", "1e4", "--out", "o"], ["marbel"]),
     "errors object": (["--scene", "ball.xml", "--model", "better_dipole", "--out", "o"], ["--scene", "none.xml"]),
-    "errors truths": (["--model", "better_dipole", "--out", "o"], ["--model", "nope"]),
     "figures all": (["fig10", "--out", "o"], ["nope"]),
     "figures compute": (["fig10", "--out", "o"], ["nope"]),
     "figures draw": (["fig10", "--out", "o"], ["nope"]),
@@ -35,7 +34,6 @@ SMALL = {  # a small run of each command, and what it refuses
     "trade": (["ball.xml", "--model", "better_dipole", "--assess", "0.05", "--out", "o"], ["marbel"]),
     "train material": (["--fast", "--steps", "20", "--out", "o", "--work", "o/work"], ["marbel"]),
     "train object": (["--scene", "ball.xml", "--out", "o"], ["--scene", "none.xml"]),
-    "validate": (["--rows", "T0134", "--quick", "--out", "o"], ["--rows", "nope"]),
     "view": (["ball.xml", "--port", "0"], ["none.xml"]),
 }
 HARNESS = """
@@ -109,7 +107,6 @@ MOUNTS = {"full": "size=4k", "locked": "ro"}
 NO_FILES = ("materials import", "materials list", "materials show", "models", "figures draw", "figures list")
 LONG = (
     "errors object",
-    "errors truths",
     "figures all",
     "fit",
     "train object",

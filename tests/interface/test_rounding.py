@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import halfspace_sss
+from benchmarks.truths import trace_order
 from halfspace_sss import Medium, measure, trace
-from halfspace_sss.comparison.truths import trace_order
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.tracing.tracer import Line, trace_curve
 

@@ -7,7 +7,7 @@ import pytest
 
 import halfspace_sss
 from halfspace_sss import BSSRDF, Medium, bssrdf, measure
-from halfspace_sss.comparison.model_truths import sampled_reflectance
+from halfspace_sss.comparison.sampled_exits import sampled_reflectance
 from halfspace_sss.measure.quadrature import Angles, cosine_nodes
 from halfspace_sss.measure.reflected_flux import MOST_SHIFTS, POINTS
 from halfspace_sss.neural.network import travel

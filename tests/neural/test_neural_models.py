@@ -8,7 +8,7 @@ import pytest
 import halfspace_sss
 from halfspace_sss import Medium
 from halfspace_sss.comparison.model_errors import ReferenceSize, model_error, reference_maps
-from halfspace_sss.comparison.model_truths import sampled_reflectance
+from halfspace_sss.comparison.sampled_exits import sampled_reflectance
 from halfspace_sss.maps.noisy_maps import CellGrid
 from halfspace_sss.neural.universal import shipped_weights
 

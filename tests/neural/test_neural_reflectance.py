@@ -8,9 +8,9 @@ import time
 import numpy as np
 import pytest
 
+from benchmarks.truths import Truth, read_truths
 from halfspace_sss import Medium, bssrdf, trace
-from halfspace_sss.comparison.model_truths import exits, sampled_reflectance
-from halfspace_sss.comparison.truths import Truth, read_truths
+from halfspace_sss.comparison.sampled_exits import exits, sampled_reflectance
 from halfspace_sss.neural.network import N_TERMS, calibration_terms, log_calibration
 from halfspace_sss.neural.universal import in_range, load_hypernetwork, shipped_weights
 from halfspace_sss.physics import single_scattering
@@ -41,7 +41,7 @@ def _with_single(R: float, t: Truth) -> float:
 
 @pytest.mark.slow
 def test_every_other_reflectance_of_the_table_is_met_within_1_5_percent() -> None:
-    """`halfspace-sss errors truths` tells all of them."""
+    """`python -m benchmarks truths` tells all of them."""
     models, known, off = {}, {}, {}
     for t in _bright(("R_d", "R_total"))[::2]:
         key = (t.medium, t.mu_i)

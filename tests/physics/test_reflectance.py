@@ -7,8 +7,8 @@ import sys
 import numpy as np
 import pytest
 
+from benchmarks.truths import read_truths
 from halfspace_sss import Medium
-from halfspace_sss.comparison.truths import read_truths
 from halfspace_sss.physics.reflectance import LARGEST_G, albedo_of_reflectance, half_space_reflectance
 
 EXACT = [t for t in read_truths()[0] if t.measure == "R_d" and t.kind == "exact"]

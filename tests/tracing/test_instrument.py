@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from traced import z
 
+from benchmarks.truths import read_truths
 from halfspace_sss import Fibre, Instrument, Layers, Medium, Ring, trace
-from halfspace_sss.comparison.truths import read_truths
 from halfspace_sss.physics.fresnel import F_t
 from halfspace_sss.tracing.instrument import LIGHT_SPEED
 from halfspace_sss.tracing.passes import estimate

@@ -1,6 +1,6 @@
-"""Reflectance of models against the published and exact values that the tracer is held against.
+"""Where light of a model leaves, and how much of it.
 
-Where light of a model leaves is drawn by quasi Monte Carlo of several proposals at once. S of a medium that scatters
+It is drawn by quasi Monte Carlo of several proposals at once. S of a medium that scatters
 forwards has ridges: light that enters near the horizon leaves close by, onwards and near the horizon again. Beside the
 positions of the model under a cosine, which see the rest of S, two lobes about the mirrored direction are drawn, which
 weigh the more the lower light enters. Each point counts by its share in the sum of all densities (balance heuristic,
@@ -10,23 +10,14 @@ Veach and Guibas 1995).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from halfspace_sss.comparison.model_errors import in_single
-from halfspace_sss.comparison.truths import read_truths
 from halfspace_sss.interface.model import BSSRDF
-from halfspace_sss.measure.reflected_flux import reflectance_estimate
-from halfspace_sss.physics.fresnel import F_r
 from halfspace_sss.physics.medium import eval_hg, sample_hg
-from halfspace_sss.progress import NamedProgress
-from halfspace_sss.registry import models_of
-
-if TYPE_CHECKING:
-    import pandas
-
 
 LOBES = ((0.6, 0.3), (0.95, 0.03))  # mean cosine about the mirrored direction, width in azimuth of the position
 NEAR = (1e-3, 50.0)  # mean free paths; their distances are uniform in the logarithm
@@ -111,42 +102,7 @@ def _density(model: BSSRDF, p: _Points) -> np.ndarray:
     return result
 
 
-MEASURES = ("R_d", "R_total")
 POINTS, REPEATS = 2**13, 4  # of each proposal; scrambles
-
-
-def reflectance_truths(
-    names: Iterable[str] | None = None,
-    progress: NamedProgress | None = None,
-    kept: dict[str, list[float]] | None = None,
-) -> pandas.DataFrame:
-    """One row per true reflectance and model that accepts its medium: truth, model's value at total order, error.
-    `names`: of models; None for all. `progress`: called with (what, done, total). `kept`: reflectances found before;
-    new ones are added. Media without scattering are left out; R_total includes the surface reflection."""
-    import pandas
-
-    names, result = None if names is None else list(names), {} if kept is None else kept
-    truths, rows = [t for t in read_truths()[0] if t.measure in MEASURES and float(t.medium.albedo) > 0], []
-    for k, t in enumerate(truths):
-        m = t.medium
-        for model in models_of(m, names):
-            key = f"{model.name} {' '.join(model.checksums)} {float(m.albedo)!r} {float(m.g)!r} {m.eta!r} {t.mu_i}"
-            if key not in result:
-                result[key] = _reflectance(model, t.mu_i)
-            R, error = (t.factor * v for v in result[key])
-            if t.measure == "R_total":
-                R += float(F_r(t.mu_i, m.eta))
-            row = {"id": t.id, "kind": t.kind, "model": model.name, "albedo": float(m.albedo), "g": float(m.g)}
-            row |= {"eta": m.eta, "mu_i": t.mu_i, "truth": t.value, "value": R, "error": error}
-            rows.append(row | {"relative_error": R / t.value - 1})
-        if progress:
-            progress("truths", k + 1, len(truths))
-    return pandas.DataFrame(rows)
-
-
-def _reflectance(model: BSSRDF, mu_i: float | str) -> list[float]:
-    """Total reflectance without the surface reflection and its error."""
-    return [float(v) for v in reflectance_estimate(model, mu_i, "total")]
 
 
 def sampled_reflectance(model: BSSRDF, mu_i: float | str, points: int = POINTS) -> tuple[float, float]:
@@ -154,18 +110,3 @@ def sampled_reflectance(model: BSSRDF, mu_i: float | str, points: int = POINTS) 
     mu_i is a cosine or "diffuse". The error is that of the mean of independent scrambles."""
     values = exits(model, [mu_i] * REPEATS, points, (0,)).flux.sum(axis=1)
     return float(values.mean()), float(values.std(ddof=1) / math.sqrt(REPEATS))
-
-
-def truth_summary(table: pandas.DataFrame) -> pandas.DataFrame:
-    """Per model and albedo below 0.5 or not: rows, median, 90th percentile and largest relative error, its medium."""
-    import pandas
-
-    rows = []
-    for (name, bright), t in table.assign(bright=table["albedo"] >= 0.5).groupby(["model", "bright"], sort=False):
-        error = t["relative_error"].abs()
-        worst = t.loc[error.idxmax()]
-        row = {"model": name, "albedo": ">= 0.5" if bright else "< 0.5", "rows": len(t), "median": error.median()}
-        row |= {"p90": error.quantile(0.9), "worst": error.max()}
-        row["worst_row"] = f"{worst['id']} a {worst['albedo']:.4g} g {worst['g']:.3g} eta {worst['eta']:.3g}"
-        rows.append(row)
-    return pandas.DataFrame(rows)

@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from figures import app as cli
-from halfspace_sss.comparison import model_truths
-from halfspace_sss.provenance import KeptRows
+from benchmarks import __main__ as cli
+from benchmarks import truths_commands
+from benchmarks.kept_rows import KeptRows
 
 
 def test_rows_of_the_same_run_are_found_again_and_others_dropped(tmp_path: Path) -> None:
@@ -30,12 +30,12 @@ def test_rows_of_the_same_run_are_found_again_and_others_dropped(tmp_path: Path)
 
 
 def _truths(out: Path) -> Any:
-    return CliRunner().invoke(cli.app, ["errors", "truths", "--model", "better_dipole", "--out", str(out)])
+    return CliRunner().invoke(cli.app, ["truths", "--model", "better_dipole", "--out", str(out)])
 
 
 @pytest.mark.slow
 def test_truths_go_on_after_what_is_kept(tmp_path: Path, monkeypatch: Any) -> None:
-    found, asked = model_truths._reflectance, []
+    found, asked = truths_commands._reflectance, []
 
     def ended(model: Any, mu_i: Any) -> list[float]:
         asked.append(mu_i)
@@ -43,7 +43,7 @@ def test_truths_go_on_after_what_is_kept(tmp_path: Path, monkeypatch: Any) -> No
             raise KeyboardInterrupt
         return found(model, mu_i)
 
-    monkeypatch.setattr(model_truths, "_reflectance", ended)
+    monkeypatch.setattr(truths_commands, "_reflectance", ended)
     assert _truths(tmp_path).exit_code != 0
     assert not (tmp_path / "truths.csv").exists()
     n = len(KeptRows(tmp_path / "truths.part", {"what": "truths"}))

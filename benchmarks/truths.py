@@ -24,7 +24,7 @@ from halfspace_sss.tracing.passes import Estimate, estimate, walk_passes
 from halfspace_sss.tracing.tracer import Trace, trace
 from halfspace_sss.tracing.walk import Boundary, Tally
 
-TABLE = Path(__file__).parent / "data" / "truths.csv"
+TABLE = Path(__file__).with_name("truths.csv")
 MEASURES = {
     "R_d": "R_d",
     "R_total": "R_total",

@@ -9,10 +9,10 @@ import math
 import pytest
 from typer.testing import CliRunner
 
-from figures.app import app
+from benchmarks.__main__ import app
+from benchmarks.truths import Comparison, read_truths, trace_order, validate
+from benchmarks.truths_commands import row_filter, summary
 from halfspace_sss import Medium, trace
-from halfspace_sss.cli.errors import row_filter, summary
-from halfspace_sss.comparison.truths import Comparison, read_truths, trace_order, validate
 from halfspace_sss.physics import single_scattering
 
 HEADER = "id,kind,quantity,geometry,albedo,g,eta,mu_i,mu_o,phi_deg,other,value,uncertainty,source,note\n"
@@ -115,7 +115,7 @@ def test_the_command_writes_rows_and_provenance_and_exits_with_zero(tmp_path):
 
 def test_the_command_exits_with_one_and_names_the_row_that_fails(tmp_path, monkeypatch):
     wrong = table(tmp_path, "T9,exact,R_d,half-space,0.5,0,1,1,,,,0.2,1e-8,,")
-    monkeypatch.setattr("halfspace_sss.comparison.truths.TABLE", wrong)
+    monkeypatch.setattr("benchmarks.truths.TABLE", wrong)
     result = command("--quick")
     assert result.exit_code == 1 and "T9" in result.output
 
