@@ -109,8 +109,8 @@ def write_atomically(path: Path, content: bytes | str) -> None:
 
 def write_together(files: Mapping[Path, bytes | str]) -> None:
     """Write files that belong together: those that are there at any moment are all whole and of the same writing.
-    All are written under temporary names first, so that a full disk leaves the files of before. OSError, which names the
-    file, if one cannot be written."""
+    All are written under temporary names first, so that a full disk leaves the files of before. OSError if a file
+    cannot be written; the message names it."""
     written: dict[Path, Path] = {}
     try:
         for path, content in files.items():
