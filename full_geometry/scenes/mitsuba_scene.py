@@ -11,7 +11,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.scenes.scene_files import parsed, references
+from full_geometry.scenes.scene_files import holds_translucent, parsed, references
 from full_geometry.settings import MM_PER_UNIT
 from full_geometry.surface.translucent import MediumSpec, is_smooth_boundary
 from full_geometry.surface.varying import VaryingMedium
@@ -40,7 +40,8 @@ def with_media(
 
     Raises:
         ValueError: mm_per_unit is out of range, or an object has something that Mitsuba's media have not: other
-            orders than "total", a boundary without reflection, or a mean cosine that differs between channels.
+            orders than "total", a boundary without reflection, a BSDF around its surface, or a mean cosine that
+            differs between channels.
     """
     check_interval("mm_per_unit", mm_per_unit, *MM_PER_UNIT)
     state, config = parsed(scene, {})
@@ -63,8 +64,13 @@ def _fill(
 ) -> None:
     """Replace the translucent surface of a shape by its boundary and an interior medium."""
     for key, index in references(shape).items():
-        if state.nodes[index].props.plugin_name() != "translucent":
+        props = state.nodes[index].props
+        if not holds_translucent(state, index) or "thickness" in props:  # a thin wall is a BSDF for Mitsuba too
             continue
+        if props.plugin_name() != "translucent":
+            raise ValueError(
+                f"translucent must stand in no other BSDF for Mitsuba's media, got {props.plugin_name()} of {shape.id()!r}"
+            )
         surface = _instance(config, state, index)
         eta = float(surface.spec.medium.eta)
         plain = {"type": "null"} if eta == 1 else {"type": "dielectric", "int_ior": eta, "ext_ior": 1.0}

@@ -318,7 +318,7 @@ def _shares_surface(state: ParserState) -> bool:
     found = []
     for node in state.nodes:
         if node.type == mi.ObjectType.Shape and node.props.plugin_name() not in NO_MESHES:
-            found += [index for index in references(node.props).values() if _is_translucent(state, index)]
+            found += [index for index in references(node.props).values() if holds_translucent(state, index)]
     return len(set(found)) < len(found)
 
 
@@ -328,10 +328,10 @@ def references(props: mi.Properties) -> dict[str, int]:
     return {key: value.index() for key, value in values.items() if isinstance(value, mi.Properties.ResolvedReference)}
 
 
-def _is_translucent(state: ParserState, index: int) -> bool:
+def holds_translucent(state: ParserState, index: int) -> bool:
     """Whether a node is a translucent surface, or something around one."""
     props = state.nodes[index].props
-    return props.plugin_name() == "translucent" or any(_is_translucent(state, k) for k in references(props).values())
+    return props.plugin_name() == "translucent" or any(holds_translucent(state, k) for k in references(props).values())
 
 
 def apart(function: Callable, parse: Callable) -> Callable:

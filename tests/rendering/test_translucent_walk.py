@@ -222,3 +222,7 @@ def test_media_that_mitsuba_cannot_express_are_refused() -> None:
         with_media(_scene({"material": "marble", "orders": "single"}), 1.0)
     with pytest.raises(ValueError, match="g must be the same"):
         with_media(_scene({**COLOURED, "g": "0,0.5,0.5"}), 1.0)
+    around = _scene({"material": "marble"})
+    around["object"]["bsdf"] = {"type": "twosided", "inside": around["object"]["bsdf"]}
+    with pytest.raises(ValueError, match="translucent must stand in no other BSDF .*, got twosided of 'object'"):
+        with_media(around, 1.0)
