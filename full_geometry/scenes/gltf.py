@@ -28,17 +28,18 @@ SUFFIXES = (".glb", ".gltf")
 MM_PER_METRE = 1000.0
 LUMENS_PER_WATT = 683.0  # by which Blender multiplies points and spots, and no suns
 PIXELS = 1024  # of the longer side of an image, where the camera does not say
-TRIANGLES = 4
+TRIANGLES, NEAREST = 4, 9728
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 EMITTERS = ("point", "spot", "directional", "envmap")
 WRAPS = {None: "repeat", 10497: "repeat", 33071: "clamp", 33648: "mirror"}
+TINTS = ("diffuseTransmissionColorTexture", "diffuseTransmissionColorFactor")
 TAKEN = {  # extensions, with what of them is taken
     "KHR_lights_punctual": (), "KHR_texture_transform": (), "KHR_materials_ior": ("ior",),
     "KHR_materials_specular": ("specularFactor",), "KHR_materials_transmission": ("transmissionFactor",),
     "KHR_materials_volume": ("thicknessFactor", "attenuationDistance", "attenuationColor"),
     "KHR_materials_volume_scatter": ("multiscatterColor", "multiscatterColorFactor", "scatterAnisotropy"),
-    "KHR_materials_diffuse_transmission": ("diffuseTransmissionFactor",),
+    "KHR_materials_diffuse_transmission": ("diffuseTransmissionFactor", *TINTS),
     "KHR_materials_emissive_strength": ("emissiveStrength",),
 }  # fmt: skip
 TURN = np.diag([-1.0, 1.0, -1.0, 1.0])  # glTF looks along -z with x to the right, Mitsuba along z
@@ -102,6 +103,9 @@ class _File:
         if maps:
             turn = mi.ScalarTransform4f(SKY)
             self._put("sky", {"type": "envmap", "filename": str(maps[0]), "to_world": turn})
+        for name in self.doc.extensionsUsed or ():
+            if name not in TAKEN and not any(name in told for told in self.not_taken):
+                self.not_taken.append(name)
         parts = [part for part in self.results.values() if isinstance(part, dict)]
         if not any("emitter" in part or part["type"] in EMITTERS for part in parts):
             self.not_taken.append("no light, so that the sky is white")
@@ -128,19 +132,27 @@ class _File:
     def _add(self, node: pygltflib.Node, place: np.ndarray) -> None:
         parts = node.extensions or {}
         self.not_taken += [name for name in parts if name not in TAKEN]
+        owners = [node] if node.mesh is None else [node, self.doc.meshes[node.mesh]]
+        said = [key for owner in owners for key in owner.extras or {} if key.startswith("sss_")]
+        self.not_taken += [f"{key} of {node.name}, which is no material" for key in said]
         if node.camera is not None:
             self._put(node.name, self._camera(node, place))
         if "KHR_lights_punctual" in parts:
             light = self.doc.extensions["KHR_lights_punctual"]["lights"][parts["KHR_lights_punctual"]["light"]]
+            self.not_taken += [f"range of {node.name}"] if "range" in light else []
             self._put(node.name, _light(light, place))
         for primitive in self.doc.meshes[node.mesh].primitives if node.mesh is not None else ():
             triangles = primitive.mode in (None, TRIANGLES)
             colored = getattr(primitive.attributes, "COLOR_0", None) is not None
-            wrong = {"points or lines": not triangles, "shape keys": primitive.targets, "colours of vertices": colored}
+            wrong = {
+                "points, lines or strips": not triangles,
+                "shape keys": primitive.targets,
+                "colours of vertices": colored,
+            }
             self.not_taken += [f"{what} of {node.name}" for what, there in wrong.items() if there]
             if triangles:
-                look = {} if primitive.material is None else self._look(primitive.material)
-                self._put(node.name, self._mesh(primitive, place) | look)
+                look = self._look(primitive.material)
+                self._put(node.name, self._mesh(primitive, node, place) | look)
 
     def _camera(self, node: pygltflib.Node, place: np.ndarray) -> dict[str, Any]:
         camera = self.doc.cameras[node.camera]
@@ -156,7 +168,7 @@ class _File:
 
     # ---- meshes
 
-    def _mesh(self, primitive: pygltflib.Primitive, place: np.ndarray) -> dict[str, Any]:
+    def _mesh(self, primitive: pygltflib.Primitive, node: pygltflib.Node, place: np.ndarray) -> dict[str, Any]:
         """A file with the mesh where it stands."""
         has, linear = primitive.attributes, place[:3, :3]
         vertices = [self._array(has.POSITION) @ linear.T + place[:3, 3]]
@@ -170,6 +182,11 @@ class _File:
             names += ["u", "v"]
         faces = np.arange(count) if primitive.indices is None else self._array(primitive.indices).astype(int)
         faces = faces.reshape(-1, 3)[:, :: 1 if np.linalg.det(linear) > 0 else -1]
+        material = self._material(primitive.material)
+        lit_behind = material.doubleSided and any(material.emissiveFactor or ()) and _is_open(vertices[0][faces])
+        bent = material.normalTexture is not None and has.TEXCOORD_0 is not None and _is_mirrored(vertices[-1][faces])
+        self.not_taken += [f"light of {node.name} behind its faces"] if lit_behind else []
+        self.not_taken += [f"mirrored uv of {node.name} under its normalTexture"] if bent else []
         lists = np.zeros(len(faces), [("n", "u1"), ("v", "<i4", 3)])
         lists["n"], lists["v"] = 3, faces
         lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
@@ -210,9 +227,17 @@ class _File:
 
     # ---- materials
 
-    def _look(self, index: int) -> dict[str, Any]:
+    def _material(self, index: int | None) -> pygltflib.Material:
+        """A material, or that of meshes without one: white rough metal."""
+        if index is not None:
+            return self.doc.materials[index]
+        import pygltflib
+
+        return pygltflib.Material(name="none")
+
+    def _look(self, index: int | None) -> dict[str, Any]:
         """The surface of a material, by its name in the scene, and what it emits."""
-        material = self.doc.materials[index]
+        material = self._material(index)
         try:
             if index not in self.looks:
                 surface = self._masked(material, self._surface(material))
@@ -223,8 +248,18 @@ class _File:
         factor = np.array(material.emissiveFactor or (0.0, 0.0, 0.0))
         if factor.any():
             factor = factor * parts.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
-            result["emitter"] = {"type": "area", "radiance": self._color(material.emissiveTexture, factor)}
+            result["emitter"] = {"type": "area", "radiance": self._emitted(material, factor)}
         return result
+
+    def _emitted(self, material: pygltflib.Material, factor: np.ndarray) -> dict[str, Any]:
+        """What a material emits, times its alpha: Mitsuba's masks hide no emitter."""
+        texture, opacity = material.emissiveTexture, self._opacity(material)
+        if np.ndim(opacity) == 0:
+            return self._color(texture, factor * (1.0 if opacity is None else opacity))
+        if texture is None:
+            return self._bitmap(material.pbrMetallicRoughness.baseColorTexture, opacity * factor, raw=False)
+        self.not_taken.append(f"alpha of emissiveTexture ({material.name})")
+        return self._color(texture, factor)
 
     def _surface(self, material: pygltflib.Material) -> dict[str, Any]:
         parts, pbr = material.extensions or {}, material.pbrMetallicRoughness
@@ -233,59 +268,85 @@ class _File:
             color = (pbr.baseColorFactor or color)[:3]
             texture, rough = pbr.baseColorTexture, pbr.metallicRoughnessTexture
             metallic, roughness = (1.0 if v is None else v for v in (pbr.metallicFactor, pbr.roughnessFactor))
-        told = [key for key in parts if key not in TAKEN]
-        told += [f"{key} of {name}" for name in TAKEN if name in parts for key in parts[name] if key not in TAKEN[name]]
-        told += ["occlusionTexture"] if material.occlusionTexture else []
+        told: dict[str, Any] = {key: True for key in parts if key not in TAKEN}
+        told |= {f"{key} of {name}": True for name in TAKEN for key in parts.get(name, ()) if key not in TAKEN[name]}
         get = {key: value for name in parts.keys() & TAKEN for key, value in parts[name].items()}
-        eta = max(modulated(get.get("ior", 1.5), get.get("specularFactor", 1.0)), 1.0001)
-        solid, clear = get.get("thicknessFactor", 0.0) > 0, get.get("transmissionFactor", 0.0)
-        leaf, base = get.get("diffuseTransmissionFactor", 0.0), self._color(texture, np.array(color))
-        given = {key[4:]: value for key, value in (material.extras or {}).items() if key.startswith("sss_")}
-        medium = None if given else gltf_medium(parts)
-        if not given and medium is None and clear and solid and get.get("attenuationDistance", math.inf) < math.inf:
-            depth = -np.log(get.get("attenuationColor", (1.0, 1.0, 1.0)))
-            medium = Medium((0.0,) * 3, depth / (MM_PER_METRE * get["attenuationDistance"]), 0.0, eta)
-        weight = given.pop("weight", 1.0)
-        if not (isinstance(weight, float | int) and 0 < weight <= 1):
-            raise ValueError(f"sss_weight must be a number in (0, 1], got {weight!r}")
-        opaque, scatters = not (given or medium or clear or (leaf and not solid)), bool(given or medium)
+        ior, specular, clear = get.get("ior", 1.5), get.get("specularFactor", 1.0), get.get("transmissionFactor", 0.0)
+        if not ior >= 1:
+            raise ValueError(f"ior must be at least 1, got {ior!r}")
+        solid, leaf = get.get("thicknessFactor", 0.0) > 0, get.get("diffuseTransmissionFactor", 0.0)
+        refracts = solid and bool(clear or "KHR_materials_volume_scatter" in parts)
+        eta = max(ior if refracts else modulated(ior, specular), 1.0001)
+        told |= {"occlusionTexture": material.occlusionTexture, "specularFactor": refracts and specular != 1}
+        base, given = self._color(texture, np.array(color)), _given(material)
         shown = {"eta": eta, "base_color": base, "roughness": self._gray(rough, 1, roughness)}
-        if solid or opaque or scatters:
-            shown |= {"type": "principled", "metallic": self._gray(rough, 2, metallic)}
-        else:
-            shown |= {"type": "principledthin", "diff_trans": 2 * leaf}
-        results = [shown if scatters else shown | {"spec_trans": clear}]
-        if scatters:
+        opaque = {"type": "principled", **shown, "metallic": self._gray(rough, 2, metallic)}
+        medium = None if given else _medium(parts, get, eta)
+        if given or medium:
+            weight = given.pop("weight", 1.0) if given or not (clear or leaf) else 1 - (1 - clear) * (1 - leaf)
+            if not (isinstance(weight, float | int) and 0 < weight <= 1):
+                raise ValueError(f"sss_weight must be a number in (0, 1], got {weight!r}")
             inside = _translucent(given, medium, base, eta)
-            left = {
+            told |= {
                 "roughness": roughness and ("bsdf" not in inside or rough is not None), "metallic": metallic,
                 "transmissionFactor": given and clear, "diffuseTransmissionFactor": given and leaf,
+                "diffuseTransmissionColorFactor": medium and leaf and get.keys() & TINTS,
                 "base color": base.get("value") != [1.0] * 3 and not given.keys() & {"radius", "mfp"} and weight == 1,
             }  # fmt: skip
-            told += [key for key, there in left.items() if there]
-            results = [shown, inside] if weight < 1 else [inside]
-        self.not_taken += [f"{key} ({material.name})" for key in told]
+            shares = {"principled": (1 - weight, opaque), "translucent": (weight, inside)}
+        elif solid:
+            told["diffuseTransmissionFactor"] = leaf
+            shares = {"glass": (1.0, opaque | {"spec_trans": clear})} if clear else {"opaque": (1.0, opaque)}
+        else:
+            told |= {"texture of metallic": rough and (clear or leaf), "gloss of diffuseTransmissionFactor": leaf}
+            other = 1.0 if rough else 1 - metallic
+            through, spread = other * clear, other * (1 - clear) * leaf
+            pane = {"type": "principledthin", "spec_trans": 1.0, **shown}
+            behind = {"type": "principledthin", "base_color": self._behind(get), "diff_trans": 2.0}
+            shares = {"opaque": (1 - through - spread, opaque), "leaf": (spread, behind), "pane": (through, pane)}
+        self.not_taken += [f"{key} ({material.name})" for key, there in told.items() if there]
+        bent = {name: (share, self._bent(material, part)) for name, (share, part) in shares.items() if share > 0}
+        if "opaque" in bent:
+            bent["opaque"] = bent["opaque"][0], {"type": "twosided", "bsdf": bent["opaque"][1]}
+        return _mixed(list(bent.values()))
+
+    def _behind(self, get: dict[str, Any]) -> dict[str, Any]:
+        """The colour of light that a thin wall spreads behind it."""
+        texture, factor = (get.get(key) for key in TINTS)
+        if texture is not None:
+            import pygltflib
+
+            texture = pygltflib.TextureInfo(**texture)
+        return self._color(texture, np.array(factor or (1.0, 1.0, 1.0)))
+
+    def _bent(self, material: pygltflib.Material, surface: dict[str, Any]) -> dict[str, Any]:
+        """A surface with the normals of its material."""
         bump = material.normalTexture
-        if bump is not None:
-            pixels = 0.5 + (self._pixels(bump.index, raw=True)[..., :3] - 0.5) * [*(bump.scale or 1.0,) * 2, 1.0]
-            bump = self._bitmap(bump, pixels, raw=True)
-            results = [{"type": "normalmap", "normalmap": bump, "bsdf": each} for each in results]
-        if len(results) == 2:
-            return {"type": "blendbsdf", "weight": weight, "bsdf_0": results[0], "bsdf_1": results[1]}
-        return {"type": "twosided", "bsdf": results[0]} if opaque else results[0]
+        if bump is None:
+            return surface
+        pixels = 0.5 + (self._pixels(bump.index, raw=True)[..., :3] - 0.5) * [*(bump.scale or 1.0,) * 2, 1.0]
+        return {"type": "normalmap", "normalmap": self._bitmap(bump, pixels, raw=True), "bsdf": surface}
 
     def _masked(self, material: pygltflib.Material, surface: dict[str, Any]) -> dict[str, Any]:
         """The surface behind the alpha of its base colour."""
+        opacity = self._opacity(material)
+        if opacity is None:
+            return surface
+        if np.ndim(opacity):
+            opacity = self._bitmap(material.pbrMetallicRoughness.baseColorTexture, opacity, raw=True)
+        return {"type": "mask", "opacity": opacity, "bsdf": surface}
+
+    def _opacity(self, material: pygltflib.Material) -> np.ndarray | float | None:
+        """The alpha of a base colour that counts: a number, or its texels (height, width, 1)."""
         pbr = material.pbrMetallicRoughness
         if material.alphaMode in (None, "OPAQUE") or pbr is None:
-            return surface
-        texture, opacity = pbr.baseColorTexture, np.array((pbr.baseColorFactor or (1.0,) * 4)[3:])
+            return None
+        texture, opacity = pbr.baseColorTexture, (pbr.baseColorFactor or (1.0,) * 4)[3]
         if texture is not None:
             opacity = opacity * self._pixels(texture.index, raw=True)[..., 3:]
         if material.alphaMode == "MASK":
             opacity = 1.0 * (opacity >= (0.5 if material.alphaCutoff is None else material.alphaCutoff))
-        shown = opacity.item() if texture is None else self._bitmap(texture, opacity, raw=True)
-        return {"type": "mask", "opacity": shown, "bsdf": surface}
+        return opacity
 
     def _color(self, texture: pygltflib.TextureInfo | None, factor: np.ndarray) -> dict[str, Any]:
         """A colour, or a texture times a colour, linear."""
@@ -316,9 +377,13 @@ class _File:
         turned = (texture.extensions or {}).get("KHR_texture_transform", {})
         if turned.get("texCoord", texture.texCoord or 0) != 0:
             raise ValueError("textures must use the first set of uv, got another")
-        sampler = self.doc.textures[texture.index].sampler
-        wrap = "repeat" if sampler is None else WRAPS[self.doc.samplers[sampler].wrapS]
-        result = {"type": "bitmap", "bitmap": mi.Bitmap(pixels.astype(np.float32)), "raw": raw, "wrap_mode": wrap}
+        result = {"type": "bitmap", "bitmap": mi.Bitmap(pixels.astype(np.float32)), "raw": raw}
+        number = self.doc.textures[texture.index].sampler
+        if number is not None:
+            sampler = self.doc.samplers[number]
+            wrap = WRAPS[sampler.wrapS]
+            self.not_taken += [f"wrapT of sampler {number}"] if WRAPS[sampler.wrapT] != wrap else []
+            result |= {"wrap_mode": wrap, "filter_type": "nearest" if sampler.magFilter == NEAREST else "bilinear"}
         if turned:
             angle, to_uv = turned.get("rotation", 0.0), np.eye(4)
             spun = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
@@ -350,6 +415,44 @@ def _translucent(given: dict[str, Any], medium: Medium | None, base: dict[str, A
         index = float(materials.load(given["material"]).medium.eta if "material" in given else given["eta"])
         result["bsdf"] = {"type": "roughdielectric", "alpha": alpha, "int_ior": index, "ext_ior": 1.0}
     return result
+
+
+def _given(material: pygltflib.Material) -> dict[str, Any]:
+    """Custom properties without their sss_."""
+    return {key[4:]: value for key, value in (material.extras or {}).items() if key.startswith("sss_")}
+
+
+def _medium(parts: dict[str, dict[str, Any]], get: dict[str, Any], eta: float) -> Medium | None:
+    """The medium of a material by its extensions, and their values: scattering, or clear and coloured."""
+    medium, distance = gltf_medium(parts), get.get("attenuationDistance", math.inf)
+    clear = get.get("thicknessFactor", 0.0) > 0 and get.get("transmissionFactor", 0.0) > 0 and distance < math.inf
+    if medium is not None or not clear:
+        return medium
+    depth = -np.log(get.get("attenuationColor", (1.0, 1.0, 1.0)))
+    return Medium((0.0,) * 3, depth / (MM_PER_METRE * distance), 0.0, eta)
+
+
+def _mixed(shares: list[tuple[float, dict[str, Any]]]) -> dict[str, Any]:
+    """Surfaces by their shares, of which the sum is 1."""
+    (whole, result), *others = shares
+    for share, part in others:
+        whole += share
+        result = {"type": "blendbsdf", "weight": share / whole, "bsdf_0": result, "bsdf_1": part}
+    return result
+
+
+def _is_open(faces: np.ndarray) -> bool:
+    """Whether triangles, shape (n, 3, 3), have an edge of one alone."""
+    _, corners = np.unique(faces.reshape(-1, 3), axis=0, return_inverse=True)
+    corners = corners.reshape(-1, 3)
+    edges = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
+    return bool((np.unique(edges, axis=0, return_counts=True)[1] == 1).any())
+
+
+def _is_mirrored(uv: np.ndarray) -> bool:
+    """Whether textures are mirrored on any triangle, whose uv have the shape (n, 3, 2), with v downwards."""
+    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    return bool((a[:, 0] * b[:, 1] > a[:, 1] * b[:, 0]).any())
 
 
 def _text(value: object) -> object:

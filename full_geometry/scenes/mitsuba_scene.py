@@ -69,7 +69,8 @@ def _fill(
             continue
         if props.plugin_name() != "translucent":
             raise ValueError(
-                f"translucent must stand in no other BSDF for Mitsuba's media, got {props.plugin_name()} of {shape.id()!r}"
+                f"translucent must stand in no other BSDF for Mitsuba's media, got {props.plugin_name()} of "
+                f"{shape.id()!r}"
             )
         surface = _instance(config, state, index)
         eta = float(surface.spec.medium.eta)

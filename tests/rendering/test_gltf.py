@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -160,7 +161,8 @@ def test_textures_keep_their_place_and_are_multiplied(tmp_path: Path) -> None:
 
 def test_a_weight_blends_the_medium_with_the_surface(tmp_path: Path) -> None:
     bumps = {"normalTexture": gltf.NormalMaterialTexture(index=0)}
-    with pytest.warns(UserWarning, match=r"not taken from it: roughness \(skin\)$"):
+    told = r"not taken from it: roughness \(skin\), mirrored uv of Ball.001 under its normalTexture$"
+    with pytest.warns(UserWarning, match=told):
         blend = gltf_scene(_glb(tmp_path, {**SKIN, "sss_weight": 0.25}, look=bumps))["material skin"]
     assert [blend[key]["type"] for key in ("bsdf_0", "bsdf_1")] == 2 * ["normalmap"]
     assert [blend[key]["bsdf"]["type"] for key in ("bsdf_0", "bsdf_1")] == ["principled", "translucent"]
@@ -189,6 +191,91 @@ def test_what_is_not_taken_is_listed_once(tmp_path: Path) -> None:
     assert message.endswith(f"ball.glb: not taken from it: {wanted}")
     assert surface["type"] == "principled"
     assert ((surface["eta"] - 1) / (surface["eta"] + 1)) ** 2 == pytest.approx(0.02)
+
+
+def _transmits(clear: float = 0.0, spread: float = 0.0, solid: dict | None = None) -> dict:
+    parts = {
+        "KHR_materials_transmission": {"transmissionFactor": clear},
+        "KHR_materials_diffuse_transmission": {
+            "diffuseTransmissionFactor": spread,
+            "diffuseTransmissionColorFactor": [1.0, 0.0, 0.0],
+        },
+    }
+    return parts if solid is None else {**parts, "KHR_materials_volume": solid}
+
+
+F, COLOR = 0.047, np.array([0.8, 0.5, 0.3])  # of light that arrives by a cosine of 0.7: mirrored; the base colour
+PASSED = {  # extensions: reflected, transmitted, what is not taken
+    "opaque": ({}, F + COLOR, 0.0, ""),
+    "pane": (_transmits(clear=0.5), F + 0.5 * COLOR, 0.5 * (1 - F) * COLOR, ""),
+    "leaf": (_transmits(spread=0.4), 0.6 * (F + COLOR), np.array([0.4, 0, 0]), "gloss of diffuseTransmissionFactor"),
+    "both": (
+        _transmits(0.5, 0.4),
+        F + 0.3 * COLOR - 0.2 * F,
+        0.5 * (1 - F) * COLOR + [0.2, 0, 0],
+        "gloss of diffuseTransmissionFactor",
+    ),
+    "solid leaf": (_transmits(spread=0.4, solid={"thicknessFactor": 1.0}), F + COLOR, 0.0, "diffuseTransmissionFactor"),
+}
+
+
+@pytest.mark.parametrize("of", PASSED)
+def test_walls_pass_light_by_their_factors_and_colours_of_both_sides(of: str, tmp_path: Path) -> None:
+    parts, reflected, transmitted, told = PASSED[of]
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        surface = mi.load_dict(gltf_scene(_glb(tmp_path, {}, parts=parts))["material skin"])
+    assert [str(w.message).split("it: ")[1] for w in warned] == ([f"{told} (skin)"] if told else [])
+    si, random = dr.zeros(mi.SurfaceInteraction3f, 2**18), mi.PCG32(2**18)
+    si.sh_frame = mi.Frame3f(mi.Vector3f(0, 0, 1))
+    for side in (1.0, -1.0):
+        si.wi = mi.Vector3f(math.sqrt(1 - 0.49), 0, side * 0.7)
+        u = mi.Point2f(random.next_float32(), random.next_float32())
+        sample, weight = surface.sample(mi.BSDFContext(), si, random.next_float32(), u)
+        found = [np.ravel(dr.mean(weight & (sample.wo.z * way > 0), axis=1)) for way in (side, -side)]
+        np.testing.assert_allclose(found, [reflected + np.zeros(3), transmitted + np.zeros(3)], atol=0.02)
+
+
+HALF = gltf.PbrMetallicRoughness(baseColorFactor=[1.0, 1.0, 1.0, 0.5])
+NEAR = {"textures": [gltf.Texture(source=0, sampler=0)], "samplers": [gltf.Sampler(magFilter=9728, wrapS=33071)]}
+BARE = gltf.Primitive(attributes=gltf.Attributes(POSITION=0, NORMAL=1), indices=3)
+FACE = gltf.Primitive(attributes=gltf.Attributes(POSITION=0), indices=None, material=0)
+GLOW = {"emissiveFactor": [1.0, 0.5, 0.2], "doubleSided": True}
+TOLD = {  # changes: what is not taken
+    "extension": ({"extensionsUsed": ["KHR_materials_variants"]}, "KHR_materials_variants"),
+    "range": ({"extensions": {"KHR_lights_punctual": {"lights": [{"type": "point", "range": 2.0}]}}}, "range of Light"),
+    "wrap": ({**NEAR, "textured": True}, "wrapT of sampler 0"),
+    "object": (
+        {"meshes": [gltf.Mesh(primitives=[BARE], extras={"sss_mfp": 1.0})]},
+        "sss_mfp of Ball.001, which is no material",
+    ),
+    "back": ({"meshes": [gltf.Mesh(primitives=[FACE])], "look": GLOW}, "light of Ball.001 behind its faces"),
+    "closed": ({"look": GLOW}, ""),
+    "ior": ({"parts": {**_transmits(1.0, solid=VOLUME), "KHR_materials_specular": {"specularFactor": 0.5}}},
+            "specularFactor (skin), roughness (skin), base color (skin)"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("of", TOLD)
+def test_what_changes_the_picture_and_is_not_taken_is_told(of: str, tmp_path: Path) -> None:
+    changes, told = TOLD[of]
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        scene = gltf_scene(_glb(tmp_path, {}, **changes))
+    assert [str(w.message).split("it: ")[1] for w in warned] == ([told] if told else [])
+    if of == "wrap":
+        assert scene["material skin"]["bsdf"]["base_color"]["filter_type"] == "nearest"
+    if of == "object":  # a mesh without a material is white rough metal
+        assert scene["material none"]["bsdf"]["metallic"] == scene["material none"]["bsdf"]["roughness"] == 1
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_alpha_hides_what_a_surface_emits_and_factors_share_coloured_glass(tmp_path: Path) -> None:
+    look = {"alphaMode": "BLEND", "pbrMetallicRoughness": HALF, "emissiveFactor": [1.0, 0.5, 0.2]}
+    scene = gltf_scene(_glb(tmp_path, {}, look=look))
+    assert scene["Ball_001"]["emitter"]["radiance"]["value"] == [0.5, 0.25, 0.1]
+    glass = gltf_scene(_glb(tmp_path, {}, parts=_transmits(0.25, solid=VOLUME)))["material skin"]
+    assert (glass["weight"], glass["bsdf_1"]["type"]) == (0.25, "translucent")
 
 
 LIGHTS = {
@@ -228,7 +315,7 @@ LOOKS = {  # what of a material, extensions: BSDFs from the outside
         "principled",
     ),
     "pane": ({}, {"KHR_materials_transmission": {"transmissionFactor": 1.0}}, "principledthin"),
-    "leaf": ({}, {"KHR_materials_diffuse_transmission": {"diffuseTransmissionFactor": 0.5}}, "principledthin"),
+    "leaf": ({}, {"KHR_materials_diffuse_transmission": {"diffuseTransmissionFactor": 0.5}}, "blendbsdf"),
     "bumps": ({"normalTexture": gltf.NormalMaterialTexture(index=0, scale=0.5)}, {}, "twosided normalmap principled"),
     "holes": ({"alphaMode": "MASK"}, {}, "mask twosided principled"),
     "lamp": ({"emissiveFactor": [1.0, 0.5, 0.2], "emissiveTexture": IMAGE}, {}, "twosided principled"),
@@ -272,6 +359,7 @@ REFUSED = [
     ({"scenes": [gltf.Scene(nodes=[0])]}, "must have a camera, got none"),
     ({"accessors": []}, "must be a valid glTF file, got IndexError"),
     ({"color": (1.5, 0.5, 0.5)}, "reflectance"),
+    ({"parts": {"KHR_materials_ior": {"ior": 0.0}}}, "material 'skin': ior must be at least 1, got 0"),
 ]
 
 
