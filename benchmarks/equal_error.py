@@ -10,17 +10,9 @@ import numpy as np
 
 from benchmarks import equal_error_tables
 from benchmarks.bench import kernel_seconds
-from figures.computing.contenders import (
-    MODELS,
-    OF_OBJECTS,
-    VOLUMES,
-    WALK,
-    contender,
-    long_passes,
-    long_walk,
-    ready,
-    volume,
-)
+from benchmarks.methods import VOLUMES, contender, ready, volume
+from benchmarks.timed import TimedRender, alternating, rendered
+from figures.computing.contenders import MODELS, OF_OBJECTS, WALK, long_passes, long_walk
 from figures.computing.learnt import (
     CHUNKS,
     FULL_GEOMETRY,
@@ -34,7 +26,6 @@ from figures.computing.learnt import (
     with_weights,
 )
 from figures.computing.scans import BUNNY, MATERIALS, SCANS, prepare
-from figures.computing.timed import TimedRender, alternating, rendered
 from figures.fig01 import VIEWS
 from figures.modelling.objects import MODELS as VARYING
 from figures.modelling.objects import TISSUES, tissue

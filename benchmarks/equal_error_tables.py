@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from benchmarks.methods import VOLUMES, label, volume
 from benchmarks.tables import in_markdown
-from figures.computing.contenders import VOLUMES, WALK, volume
-from figures.drawing.image_grid import label
+from figures.computing.contenders import WALK
 from figures.parts.part import Params, Row
 from halfspace_sss.comparison.style import look
 

@@ -14,11 +14,10 @@ from matplotlib.image import imsave
 
 from benchmarks.gallery_meshes import FOLDER
 from benchmarks.things import against_walks
-from figures.computing.contenders import NOTE, reference_image
+from figures.computing.contenders import COMPILING, NOTE, reference_image
 from figures.computing.images import FLIP, Shot
 from figures.computing.learnt import weight_files
 from figures.computing.scans import prepare
-from figures.computing.timed import COMPILING
 from figures.drawing.image_grid import image_files, rows_of
 from figures.parts.part import Part, Result, Task
 from full_geometry.trade.image_differences import srgb

@@ -11,9 +11,9 @@ import numpy as np
 import pandas
 
 from benchmarks.speeds import LitObject, scene_of, train
+from benchmarks.timed import rendered
 from figures.computing.contenders import WALK
 from figures.computing.scans import prepare
-from figures.computing.timed import rendered
 from figures.parts.part import Row
 from full_geometry.integrators.gathering import Gathering
 from full_geometry.trade.denoising import cover

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from figures.computing.contenders import NOTE, against, long_reference, reference_shot
+from benchmarks.timed import power_of_two, rendered
+from figures.computing.contenders import NOTE, against, gathered_anew, long_reference, reference_shot
 from figures.computing.images import FLIP, Shot
 from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training_of, with_weights
 from figures.computing.scans import BUNNY, prepare, scan_scene
-from figures.computing.timed import gathered_anew, power_of_two, rendered
 from figures.drawing.image_grid import image_files
 from figures.parts.part import Part, Result, Row, Task
 from full_geometry.scenes.scene_files import PATH_TRACED, load_scene

@@ -19,11 +19,12 @@ import numpy as np
 import pandas
 
 from benchmarks.hand_and_ribbon import SHAPES, STANDING
+from benchmarks.methods import ready, volume
 from benchmarks.published import meat  # noqa: F401  # an object more
-from figures.computing.contenders import WALK, ready, volume
+from benchmarks.timed import TimedRender, alternating, rendered
+from figures.computing.contenders import WALK
 from figures.computing.learnt import object_parts
 from figures.computing.scans import SCANS, prepare, scan_scene, surroundings
-from figures.computing.timed import TimedRender, alternating, rendered
 from figures.fig01 import VIEWS
 from figures.modelling.meshes import surface
 from figures.modelling.objects import MODELS as VARYING

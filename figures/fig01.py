@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from figures.computing.contenders import NOTE, OF_OBJECTS, against, reference_image, reference_shot
+from figures.computing.contenders import COMPILING, NOTE, OF_OBJECTS, against, reference_image, reference_shot
 from figures.computing.images import Shot
 from figures.computing.learnt import (
     CHUNKS,
@@ -21,7 +21,6 @@ from figures.computing.learnt import (
     with_weights,
 )
 from figures.computing.scans import environment, environment_file, prepare
-from figures.computing.timed import COMPILING
 from figures.drawing.image_grid import image_files, label, rows_of
 from figures.modelling.objects import TISSUES, tissue
 from figures.parts.part import Part, Result, SceneDict, Task

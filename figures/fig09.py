@@ -7,11 +7,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from figures.computing import contenders
-from figures.computing.contenders import NOTE, against, long_reference, reference_shot
+from figures.computing.contenders import COMPILING, NOTE, against, gathered_anew, long_reference, reference_shot
 from figures.computing.images import Shot
 from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training_of, weight_files, with_weights
 from figures.computing.scans import BUNNY, MATERIALS, prepare, scan_scene
-from figures.computing.timed import COMPILING, gathered_anew
 from figures.drawing.image_grid import image_files, label
 from figures.parts.part import Part, Result, Task
 from halfspace_sss import materials

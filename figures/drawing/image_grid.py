@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import TextPath
 
-from figures.computing.contenders import VOLUMES, WALK
+from figures.computing.contenders import WALK
 from figures.computing.images import FLIP, Shot, absent
 from figures.drawing.page import check_scenes, page
 from figures.parts.part import Row
@@ -180,9 +180,6 @@ def image_files(
 
 def label(method: str) -> str:
     """The name of a method as people read it."""
-    if method in VOLUMES:
-        kind, rr_depth = method.split()
-        return f"Mitsuba {kind}, roulette from {rr_depth}"
     if method == WALK:
         return "Our walk"
     return "Neural half-space" if method == "neural" else look(method).label

@@ -13,9 +13,10 @@ from quick_light import gather_by_few
 
 from benchmarks import equal_error, equal_error_tables
 from benchmarks.equal_error import MODELLED, STEPS, furnace, furnace_models, modelled_contender, modelled_scene
-from figures.computing.contenders import MODELS, VOLUMES, WALK, contender
+from benchmarks.methods import VOLUMES, contender
+from benchmarks.timed import TimedRender, rendered
+from figures.computing.contenders import MODELS, WALK
 from figures.computing.scans import MM_PER_UNIT, prepare
-from figures.computing.timed import TimedRender, rendered
 from figures.parts.part import Part, Result, Task
 from full_geometry.learning import training
 from full_geometry.learning.network_fitting import Recipe

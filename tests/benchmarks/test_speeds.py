@@ -10,7 +10,7 @@ pytest.importorskip("mitsuba")
 from benchmarks.gathered_error import off  # noqa: E402
 from benchmarks.hand_and_ribbon import SHAPES  # noqa: E402
 from benchmarks.speeds import PASSES, LitObject, Measuring, _noise, ways_of  # noqa: E402
-from figures.computing.timed import TimedRender  # noqa: E402
+from benchmarks.timed import TimedRender  # noqa: E402
 from figures.modelling.meshes import surface  # noqa: E402
 
 

@@ -309,7 +309,7 @@ def test_a_missing_library_is_named_and_a_mistake_is_not_hidden(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["compute", "fig01"], "did you mean 'fig10'?"),
+        (["compute", "fig100"], "did you mean 'fig10'?"),
         (["draw", "toy", "--quality", "drft"], "drft"),
         (["paint"], "paint"),
         (["draw", "toy"], "parts of toy must be computed before it is drawn"),

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from halfspace_sss.backend import clock
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.progress import Progress
 
@@ -18,7 +17,6 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
 MOST_LANES = 2**22  # camera rays of a pass, for memory
-COMPILING = 2  # samples per pixel of a render that is not timed: a power of two has the kernels of all others
 GROWTH, MOST_TRIALS = 16, 8  # of the number of samples of a pass that is looked for
 
 
@@ -43,14 +41,6 @@ class TimedRender:
     def seconds(self) -> float:
         """Of all passes."""
         return float(sum(self.pass_seconds))
-
-
-def gathered_anew(scene: mi.Scene) -> float:
-    """Gather the light of a scene by `bssrdf` as if it never had been; the CPU seconds that takes."""
-    started = clock()
-    scene.integrator().gathering = type(scene.integrator().gathering)()
-    scene.integrator().prepare(scene)
-    return clock() - started
 
 
 def rendered(scene: mi.Scene, spp: int, *seed: int) -> tuple[np.ndarray, float]:

@@ -11,11 +11,10 @@ import numpy as np
 import pandas
 import pytest
 
-from figures import fig11
-from figures.computing import timed
-from figures.computing.contenders import VOLUMES, contender
-from figures.computing.timed import alternating, pass_size
-from figures.drawing.image_grid import label
+from benchmarks import timed
+from benchmarks.methods import VOLUMES, contender, label
+from benchmarks.published import fig11
+from benchmarks.timed import alternating, pass_size
 from figures.parts.part import Part, Result, Task
 from full_geometry.trade.denoising import denoised, guides
 from halfspace_sss.backend import BackendError
