@@ -7,6 +7,7 @@ from benchmarks.ablation_command import ablation_command
 from benchmarks.bench_command import bench
 from benchmarks.disturbed import disturbed_command
 from benchmarks.inversion_command import inversion_command
+from benchmarks.media_errors import media_errors_command
 from benchmarks.rivals_command import rivals_command
 from benchmarks.shapes_command import shapes_command
 from benchmarks.speeds_command import gathered_command, speeds_command
@@ -27,6 +28,7 @@ COMMANDS = {
     "disturbed": disturbed_command,
     "gathered": gathered_command,
     "inversion": inversion_command,
+    "media-errors": media_errors_command,
     "rivals": rivals_command,
     "shapes": shapes_command,
     "speeds": speeds_command,

@@ -40,7 +40,6 @@ LESS = {  # what a command is given beside, by the longest of these that it star
     "train material ketchup": "--channel R --fast --steps 20",
     "trade ball.xml": "--assess 0.1 --model better_dipole",
     "errors materials": "--events 1e5 --channel R --model better_dipole",
-    "errors materials --held-out": "--events 1e5 --held-out 2",
     "errors object": "--exits 16",
     "maps": "--grid 2,16,6,4 --paths 2048 --channel R",
     "maps --sigma-t": "--grid 2,16,6,4 --paths 2048",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -33,19 +33,6 @@ DEFINITION = (
 
 
 @dataclass(frozen=True)
-class MediaOptions:
-    """Media without names."""
-
-    registry: Annotated[bool, typer.Option("--registry", help="Every channel of all registered materials.")] = False
-    held_out: Annotated[
-        int | None, typer.Option(help="Number of random media over the range of `neural`.", parser=shared.whole)
-    ] = None
-    as_trained: Annotated[
-        bool, typer.Option("--as-trained", help="Draw held-out media as in training: a third with g near 1.")
-    ] = False
-
-
-@dataclass(frozen=True)
 class ReferenceOptions:
     """What models are compared with."""
 
@@ -60,7 +47,6 @@ class ReferenceOptions:
 
 def errors_materials(
     stated: shared.MediumOptions,
-    many: MediaOptions,
     traced: ReferenceOptions,
     places: shared.Places,
     material: shared.Materials = None,
@@ -69,11 +55,41 @@ def errors_materials(
     out: shared.OutFolder = Path("errors"),
 ) -> None:
     """Compare models with path tracing over all directions: error, bias, decades of r; written as CSV and JSON."""
+    media = channels_of(stated.media(material or [], channel), bool(channel))
+    compared(media, traced, places, model, out, _tables)
+
+
+def _tables(found: pandas.DataFrame) -> list[Table | str]:
+    if found["medium"].nunique() > 3:
+        from halfspace_sss.comparison.model_errors import percentiles
+
+        return [percent_table(percentiles(found), "errors over the media, %")]
+    columns = ["medium", "model", "error", *SQUARE, "noise", "bias", *(c for c in found if c.startswith("r "))]
+    return [percent_table(found[columns], "errors, %")]
+
+
+def channels_of(media: Mapping[str, Medium], chosen: bool = False) -> dict[str, Medium]:
+    """Scalar media by label: channels of materials that scatter; those of a medium that is stated, or `chosen`, all."""
+    from halfspace_sss import materials
+
+    results = {}
+    for title, medium in media.items():
+        labels = () if chosen or title == "medium" else materials.load(title).channels
+        for label, one in zip(labels or ("",), medium.channels()):
+            if float(one.albedo) > 0 or not labels:
+                results[f"{title} {label}".strip()] = one
+    return results
+
+
+def compared(
+    media: Mapping[str, Medium], traced: ReferenceOptions, places: shared.Places, model: list[str] | None, out: Path,
+    tables: Callable[[pandas.DataFrame], list[Table | str]],
+) -> None:  # fmt: skip
+    """Write the errors of models of media, a row each, and show tables of them."""
     from halfspace_sss.checks import check_interval
     from halfspace_sss.comparison import model_errors
 
-    media = _media(stated, material or [], channel, many, traced.seed)
-    block, n = int(traced.block), len(media)
+    block = int(traced.block)
     check_models(model)
     check_interval("events", traced.events, 1e4, 1e12)
     _check_accepted(model or (), list(media.values()))
@@ -85,39 +101,13 @@ def errors_materials(
             bar.show(round(1000 * ((what == "models") + done / total)), 2000, what)
 
         references = model_errors.references(
-            list(media.values()), traced.events * n, traced.seed, block, show, traced.backend, executor
+            list(media.values()), traced.events * len(media), traced.seed, block, show, traced.backend, executor
         )
         found = model_errors.error_table(media, references, model or None, show, executor)
     how = {"events": traced.events, "block": block, "seed": traced.seed}
     files = write_errors(out, found, model_errors.percentiles(found), DEFINITION.format(block), how)
-    shared.say(*_tables(found, n), DEFINITION.format(block))
+    shared.say(*tables(found), DEFINITION.format(block))
     shared.say_files(files)
-
-
-def _media(
-    stated: shared.MediumOptions, names: list[str], channel: str | None, many: MediaOptions, seed: int
-) -> dict[str, Medium]:
-    """Scalar media by label."""
-    from halfspace_sss import materials
-    from halfspace_sss.checks import check_count
-    from halfspace_sss.comparison.model_errors import held_out_media
-
-    if many.as_trained and many.held_out is None:
-        raise ValueError("as_trained must come with held_out, got it alone")
-    given = bool(names) or stated != shared.MediumOptions()
-    if given + many.registry + (many.held_out is not None) > 1:
-        raise ValueError("material, registry and held_out must be given one at a time, got several")
-    if many.held_out is not None:
-        check_count("held_out", many.held_out, 1)
-        media = held_out_media(many.held_out, seed, many.as_trained)
-        return {f"a {float(m.albedo):.5g} g {float(m.g):.3g} eta {m.eta:.3g}": m for m in media}
-    results = {}
-    for title, medium in stated.media(materials.names() if many.registry else names, channel).items():
-        labels = () if channel or title == "medium" else materials.load(title).channels
-        for label, one in zip(labels or ("",), medium.channels()):
-            if float(one.albedo) > 0 or not labels:
-                results[f"{title} {label}".strip()] = one
-    return results
 
 
 def check_models(names: Sequence[str] | None) -> None:
@@ -152,21 +142,6 @@ def write_errors(
     files = {out / "errors.csv": shared.csv_of(found), out / "errors.json": json.dumps(content, indent=1)}
     write_together(files)
     return list(files)
-
-
-def _tables(found: pandas.DataFrame, n_media: int) -> list[Table | str]:
-    from halfspace_sss.comparison.model_errors import bands, losses, percentiles
-
-    if n_media <= 3:
-        columns = ["medium", "model", "error", *SQUARE, "noise", "bias", *(c for c in found if c.startswith("r "))]
-        return [percent_table(found[columns], "errors, %")]
-    results: list[Table | str] = [percent_table(percentiles(found), "errors over the media, %")]
-    if (found["model"] == "neural").any():
-        results.append(percent_table(bands(found, "neural"), "neural over ranges of media, %"))
-        lost = losses(found, "neural")[["medium", "error", *SQUARE, "noise", "model_best", "error_best"]]
-        title = f"media on which an analytic model has a smaller error than neural: {len(lost)}"
-        results.append(percent_table(lost, title) if len(lost) else title)
-    return results
 
 
 def percent_table(frame: pandas.DataFrame, title: str) -> Table:

@@ -8,7 +8,7 @@ blocks, which is stated with it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
@@ -18,7 +18,6 @@ import numpy as np
 from halfspace_sss.arrays import library
 from halfspace_sss.executors import completed
 from halfspace_sss.interface.model import BSSRDF
-from halfspace_sss.maps.grid import draw_media
 from halfspace_sss.maps.noisy_maps import LEAST_ALBEDO, CellGrid, Groups, make_pool, radial_edges
 from halfspace_sss.measure.reflected_flux import evaluated
 from halfspace_sss.noise_free import NoiseFree
@@ -311,25 +310,6 @@ def reference_maps(
 
 HELD_OUT_SEED = 15485863
 GRID, BLOCK = CellGrid(40, 16), 4
-BANDS: dict[str, Callable[[pandas.DataFrame], pandas.Series]] = {
-    "albedo < 0.5": lambda t: t["albedo"] < 0.5,
-    "albedo 0.5-0.9": lambda t: (t["albedo"] >= 0.5) & (t["albedo"] < 0.9),
-    "albedo 0.9-0.99": lambda t: (t["albedo"] >= 0.9) & (t["albedo"] < 0.99),
-    "albedo >= 0.99": lambda t: t["albedo"] >= 0.99,
-    "g < 0.5": lambda t: t["g"] < 0.5,
-    "g 0.5-0.9": lambda t: (t["g"] >= 0.5) & (t["g"] < 0.9),
-    "g >= 0.9": lambda t: t["g"] >= 0.9,
-}
-
-
-def held_out_media(n: int, seed: int = 0, as_trained: bool = False) -> list[Medium]:
-    """Media over the whole range, from other seeds than those of the training.
-
-    g is uniform, or, `as_trained`, log-uniform in 1 - g for a third of them: a harder set. albedo and eta as there.
-    """
-    rng = np.random.default_rng([HELD_OUT_SEED, seed])
-    ratios = draw_media(n, rng) if as_trained else draw_media(n, rng, steep_share=0.0)
-    return [Medium.from_albedo(float(a), 1.0, float(g), float(eta)) for a, g, eta in zip(*ratios)]
 
 
 def references(
@@ -392,26 +372,3 @@ def percentiles(table: pandas.DataFrame) -> pandas.DataFrame:
         row |= {"p90": t["error"].quantile(0.9), "worst": worst["error"], "worst_medium": worst["medium"]}
         rows.append(row | {"median_abs_bias": t["bias"].abs().median(), "median_noise": t["noise"].median()})
     return pandas.DataFrame(rows)
-
-
-def bands(table: pandas.DataFrame, name: str) -> pandas.DataFrame:
-    """Median and 90th percentile of the error of one model over ranges of albedo and g."""
-    import pandas
-
-    mine = table[table["model"] == name]
-    rows = []
-    for band, choose in BANDS.items():
-        t = mine[choose(mine)]
-        if len(t):
-            row = {"media": band, "count": len(t), "median": t["error"].median(), "p90": t["error"].quantile(0.9)}
-            rows.append(row | {"median_noise": t["noise"].median(), "median_abs_bias": t["bias"].abs().median()})
-    return pandas.DataFrame(rows)
-
-
-def losses(table: pandas.DataFrame, name: str = "neural") -> pandas.DataFrame:
-    """Media on which a model that is not learnt has a smaller error than `name`."""
-    analytic = table[~table["model"].str.startswith("neural")]
-    best = analytic.loc[analytic.groupby("medium")["error"].idxmin()].set_index("medium")
-    mine = table[table["model"] == name].set_index("medium")
-    both = mine.join(best[["model", "error"]].add_suffix("_best"))
-    return both[both["error_best"] < both["error"]].reset_index()

@@ -20,6 +20,7 @@ WRONG = {
     "figures": ["all", "marbel"],
     "gathered": ["--object", "marbel"],
     "inversion": ["--size", "0"],
+    "media-errors": ["--held-out", "0"],
     "rivals": ["--scene", "none.xml"],
     "shapes": ["--objects", "-1"],
     "speeds": ["--object", "marbel"],
