@@ -278,13 +278,15 @@ def analyse_shape(shape: mi.Shape, world: mi.Scene | None = None, groups: Iterab
 
     Raises:
         ValueError: the shape is an instance, whose geometry belongs to several objects; faces of a mesh exist twice;
-            closed pieces of it touch or overlap; or faces point to both sides of a surface that has one side or is not
-            closed.
+            closed pieces of it touch or overlap; faces point to both sides of a surface that has one side or is not
+            closed; or a sphere is stretched.
     """
     if is_instance(shape):
         raise ValueError(f"a translucent object must not be an instance, got {shape.id() or shape}")
     if shape.is_mesh() and shape.face_count() == 0:
         raise ValueError(f"a mesh must have faces, got none in {name_of(shape)}")
+    if shape.class_name() == "Sphere":  # rays would meet a ball that is shaded as another shape
+        check_stretch(f"object {name_of(shape)}", mi.traverse(shape)["to_world"], any_size=True)
     scene = scene_of([shape], world)
     box = scene.bbox()
     low, high = np.array(box.min, dtype=float), np.array(box.max, dtype=float)
@@ -328,6 +330,20 @@ def analyse_shape(shape: mi.Shape, world: mi.Scene | None = None, groups: Iterab
         pieces=votes.pieces, size=size, area=area, state=geometry_of(shape), lost=odd,
         group=next((group for group in groups if any(shape is part for part in group.shapes)), None),
     )  # fmt: skip
+
+
+UNEVEN = 1e-3  # of scales along axes
+
+
+def check_stretch(name: str, to_world: mi.Transform4f, any_size: bool = False) -> None:
+    """ValueError if a transformation stretches, as rotations do about an axis of another length than 1.
+    `any_size`: whether it may change the size."""
+    scales = np.linalg.svd(matrix_of(to_world)[:3, :3], compute_uv=False)
+    if scales[0] - scales[-1] > UNEVEN * scales[0] or not (any_size or abs(scales[0] - 1) < UNEVEN):
+        raise ValueError(
+            f"to_world of {name} must {'not stretch' if any_size else 'turn'} it, and axes of rotations have the "
+            f"length 1, got scales from {scales[-1]:.3g} to {scales[0]:.3g}"
+        )
 
 
 PLACES = (*mesh.GEOMETRY, "to_world", "grid", "control_points", "data", "extent")

@@ -21,7 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.geometry.rounding import before, blocked, bound_of
-from full_geometry.geometry.shape import by_pointer, looked_up, pointer_numbers
+from full_geometry.geometry.shape import by_pointer, check_stretch, looked_up, pointer_numbers
 from full_geometry.objects.inclusions import check_lamps
 from full_geometry.surface.wrapped import surface_of
 
@@ -257,11 +257,14 @@ def is_delta(emitter: mi.Emitter) -> bool:
 
 def check_emitters(scene: mi.Scene) -> None:
     """Refuse emitters that do not work, and warn of those that no path from a camera finds.
-    ValueError for an emitter that Mitsuba's own path tracers cannot evaluate either, for light that is not finite, or
-    as of `check_lamps`."""
+    ValueError for an emitter that Mitsuba's own path tracers cannot evaluate either, for light that is not finite, an
+    environment that is stretched, or as of `check_lamps`."""
     check_lamps(scene)
     for emitter in scene.emitters():
         _check_finite(emitter)
+        parameters = mi.traverse(emitter)
+        if emitter.is_environment() and "to_world" in parameters:  # else what is sampled is not what rays meet
+            check_stretch(f"emitter {emitter.id()!r}", parameters["to_world"])
         kind = emitter.class_name()
         if kind.startswith("TimedSunsky"):
             raise ValueError(

@@ -8,6 +8,7 @@ path tracer in `test_translucent_walk.py`. Every comparison states its orders, a
 from __future__ import annotations
 
 import gc
+import re
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
@@ -311,6 +312,24 @@ def test_emitters_that_fail_in_symbolic_loops_are_refused_by_name(integrator: st
     with pytest.raises((RuntimeError, ValueError)) as refused:
         mi.render(scene, spp=1)
     assert "got timed_sunsky" in str(refused.value.__cause__ or refused.value)
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("sky", "to_world of emitter 'sky' must turn it, and axes of rotations have the length 1, got scales from 1.19"),
+        ("ball", "to_world of object 'object' must not stretch it, .* got scales from 1 to 2"),
+    ],
+)
+@pytest.mark.parametrize("integrator", ["translucent_walk", "bssrdf"])
+def test_skies_and_spheres_that_are_stretched_are_refused(integrator: str, kind: str, message: str) -> None:
+    at, even = mi.ScalarTransform4f(), mi.Bitmap(np.ones((4, 8, 3), dtype=np.float32))
+    sky = {"type": "envmap", "bitmap": even, "to_world": at.rotate([1, 1, 0], 40) if kind == "sky" else at}
+    scene = _scene({"type": integrator}, {"sky": sky}, model="lambert")
+    scene["object"] = {**scene["object"], **({"to_world": at.scale([1, 1, 2])} if kind == "ball" else {})}
+    with pytest.raises((RuntimeError, ValueError)) as refused:
+        mi.render(mi.load_dict(scene), spp=1)
+    assert re.search(message, str(refused.value.__cause__ or refused.value))
     del scene, refused
     gc.collect()  # calls of emitters go to all that live, and this one fails in them
 
