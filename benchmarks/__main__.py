@@ -21,7 +21,9 @@ from halfspace_sss.cli.shared import Commands, add, group
 figures.ADDED |= {"equal_error": "benchmarks.equal_error", "trade": "benchmarks.trade_figure"}
 STUDIES = ("gallery", "gathered", "scenes", "spheres", "textures", "thin")
 figures.ADDED |= {name: f"benchmarks.{name}_figure" for name in STUDIES}
-figures.ADDED |= {name: f"benchmarks.published.{name}" for name in ("fig03", "fig07", "fig08", "fig11", "table1")}
+figures.ADDED |= {
+    name: f"benchmarks.published.{name}" for name in ("fig01", "fig03", "fig07", "fig08", "fig11", "table1")
+}
 COMMANDS = {
     "ablation": ablation_command,
     "bench": bench,

@@ -11,6 +11,10 @@ import numpy as np
 from benchmarks import equal_error_tables
 from benchmarks.bench import kernel_seconds
 from benchmarks.methods import VOLUMES, contender, ready, volume
+from benchmarks.modelling.learnt import object_parts, train_modelled
+from benchmarks.modelling.objects import MODELS as VARYING
+from benchmarks.modelling.objects import TISSUES, tissue
+from benchmarks.published.fig01 import VIEWS
 from benchmarks.timed import TimedRender, alternating, rendered
 from figures.computing.contenders import MODELS, OF_OBJECTS, WALK, long_passes, long_walk
 from figures.computing.learnt import (
@@ -18,17 +22,12 @@ from figures.computing.learnt import (
     FULL_GEOMETRY,
     TRAINING,
     accepting,
-    object_parts,
-    train_modelled,
     train_scan,
     training_of,
     weight_files,
     with_weights,
 )
 from figures.computing.scans import BUNNY, MATERIALS, SCANS, prepare
-from figures.fig01 import VIEWS
-from figures.modelling.objects import MODELS as VARYING
-from figures.modelling.objects import TISSUES, tissue
 from figures.parts.part import Params, Part, Result, SceneDict, Task
 from full_geometry.trade.denoising import cover
 from halfspace_sss import materials

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from benchmarks.modelling.meshes import capsule, join, overlap, twisted
 from benchmarks.random_shapes import Made, box, margin
-from figures.modelling.meshes import capsule, join, overlap, twisted
 
 
 def hand() -> Made:

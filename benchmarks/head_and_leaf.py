@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.modelling.meshes import Box, Mesh, capsule, cut, ellipsoid, join, overlap, smoothstep, surface
 from benchmarks.random_shapes import Made, margin
-from figures.modelling.meshes import Box, Mesh, capsule, cut, ellipsoid, join, overlap, smoothstep, surface
 from figures.parts.part import SceneDict
 
 BOX = Box((-1.3, -2.1, -1.5), (1.3, 1.6, 1.6))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.head_and_leaf import leaves
+from benchmarks.modelling.meshes import capsule, cut, join, length, overlap, rotated, smoothstep
 from benchmarks.random_shapes import Made, margin
-from figures.modelling.meshes import capsule, cut, join, length, overlap, rotated, smoothstep
 
 STROKES = {  # of letters, in a square
     "A": [((0, 0), (0.5, 1)), ((0.5, 1), (1, 0)), ((0.2, 0.4), (0.8, 0.4))],

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from figures.modelling.meshes import (
+from benchmarks.modelling.meshes import (
     Box,
     Distance,
     Mesh,

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.head_and_leaf import LEAVES, make_head, write_painted
+from benchmarks.modelling.meshes import Box, surface
 from benchmarks.random_shapes import box, make_shape
 from benchmarks.things import Staging, against_walks, lit_scene, shown, thing_parts, walked
 from figures.computing.contenders import NOTE
 from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, trained, training_of, weight_files, with_weights
 from figures.computing.scans import prepare
 from figures.drawing.image_grid import image_files, rows_of
-from figures.modelling.meshes import Box, surface
 from figures.parts.part import Part, Result, SceneDict, Task
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder

@@ -20,15 +20,15 @@ import pandas
 
 from benchmarks.hand_and_ribbon import SHAPES, STANDING
 from benchmarks.methods import ready, volume
+from benchmarks.modelling.learnt import object_parts
+from benchmarks.modelling.meshes import surface
+from benchmarks.modelling.objects import MODELS as VARYING
+from benchmarks.modelling.objects import tissue
 from benchmarks.published import meat  # noqa: F401  # an object more
+from benchmarks.published.fig01 import VIEWS
 from benchmarks.timed import TimedRender, alternating, rendered
 from figures.computing.contenders import WALK
-from figures.computing.learnt import object_parts
 from figures.computing.scans import SCANS, prepare, scan_scene, surroundings
-from figures.fig01 import VIEWS
-from figures.modelling.meshes import surface
-from figures.modelling.objects import MODELS as VARYING
-from figures.modelling.objects import tissue
 from figures.parts.part import Row, SceneDict
 from full_geometry.trade.denoising import cover
 from halfspace_sss import materials

@@ -38,7 +38,7 @@ from importlib.metadata import entry_points
 
 __all__ = ["FIGURES", "figure_modules"]
 
-FIGURES = ("fig01", "fig05", "fig06", "fig09", "fig10", "fig12")
+FIGURES = ("fig05", "fig06", "fig09", "fig10", "fig12")
 GROUP = "halfspace_sss.figure_modules"
 ADDED: dict[str, str] = {}  # name -> module of figures that a program adds, as `benchmarks` does
 

@@ -30,7 +30,7 @@ FLOORS = {  # of each package, a room or file may import those to its left; "" i
         "", "geometry", "surface", "objects", "walk", "transport", "precomputed", "integrators", "scenes",
         "learning", "inverse", "trade", "viewing", "plugins", "cli",
     ],
-    "figures": ["parts", "modelling", "computing", "drawing", ""],
+    "figures": ["parts", "computing", "drawing", ""],
 }  # fmt: skip
 HIDING = {"bssrdf", "curves", "models", "trace"}  # public functions: a folder of that name would hide one
 LONGEST_BODY = 60

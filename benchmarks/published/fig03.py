@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from figures.computing.learnt import object_parts
+from benchmarks.modelling.learnt import object_parts
 from figures.computing.scans import BUNNY, prepare, scan_scene
 from figures.parts.part import Params, Part, Result, Task
 from halfspace_sss.comparison.style import TEXT, paper, saved

@@ -8,21 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.modelling.learnt import object_parts, train_modelled
+from benchmarks.modelling.objects import TISSUES
 from benchmarks.published import meat  # noqa: F401  # an object more
+from benchmarks.published.fig01 import LIGHT, RESOLUTION, SIZES, TRUTH, VIEWS, View, foot, scene, shown
+from benchmarks.published.fig01 import SPP as OURS_SPP
 from figures.computing.contenders import NOTE, against, reference_shot
 from figures.computing.images import Shot
-from figures.computing.learnt import (
-    CHUNKS,
-    FULL_GEOMETRY,
-    object_parts,
-    train_modelled,
-    training_of,
-)
+from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, training_of
 from figures.computing.scans import environment_file, prepare
 from figures.drawing.image_grid import image_files
-from figures.fig01 import LIGHT, RESOLUTION, SIZES, TRUTH, VIEWS, View, foot, scene, shown
-from figures.fig01 import SPP as OURS_SPP
-from figures.modelling.objects import TISSUES
 from figures.parts.part import Part, Result, SceneDict, Task
 from halfspace_sss.provenance import check_folder
 

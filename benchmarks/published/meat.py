@@ -1,4 +1,4 @@
-"""A steak of marbled beef, which Fig. 7 has beside the objects of `figures.modelling`; lengths in mm.
+"""A steak of marbled beef, which Fig. 7 has beside the objects of `benchmarks.modelling`; lengths in mm.
 
 The import of this module adds it to `MODELS` and to the views of Fig. 1.
 """
@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from figures.fig01 import VIEWS, View
-from figures.modelling.meshes import Box, cells, fbm, length, noise, overlap, rotated, smoothstep
-from figures.modelling.objects import MODELS
+from benchmarks.modelling.meshes import Box, cells, fbm, length, noise, overlap, rotated, smoothstep
+from benchmarks.modelling.objects import MODELS
+from benchmarks.published.fig01 import VIEWS, View
 
 MEAT_BOX = Box((-46.0, -1.5, -35.0), (46.0, 24.0, 35.0))
 HALF_LENGTH, HALF_WIDTH, THICKNESS = 41.0, 29.0, 20.0

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from figures.computing.scans import BUNNY, MM_PER_UNIT, SCANS, prepare, scan_scene
-from figures.modelling.objects import candle_parts, learnable_parts, make_varying
 from figures.parts.part import Part, Result, SceneDict, Task
 from halfspace_sss import materials
 from halfspace_sss.neural.store import weights_in
@@ -52,7 +51,6 @@ def with_weights(folder: Path, needed: Mapping[str, Result]) -> Iterator[None]:
 
 
 CHUNKS = {"draft": 2, "paper": 8}  # of all figures, which share parts; seconds would depend on what else runs
-GRID = 0.5  # cells of a medium along an object over cubes of its surface
 
 
 def train_scan(name: str, material: str, chunks: int, scan: str = "bunny") -> Part:
@@ -63,34 +61,10 @@ def train_scan(name: str, material: str, chunks: int, scan: str = "bunny") -> Pa
     return Part(training_of(name), _scanned, params, chunks, inputs=(SCANS[scan].file,))
 
 
-def train_modelled(name: str, resolution: int, chunks: int) -> Part:
-    """The part in which a modelled object is learnt.
-    `name`: "candle", or in `modelling.objects.MODELS`. `resolution`: of its surface. `chunks`: as in `train_scan`."""
-    params = {"object": name, "resolution": resolution, "chunks": chunks, "seed": 0, "model": FULL_GEOMETRY}
-    return Part(training_of(name), _modelled, params, chunks)
-
-
-def object_parts(name: str, resolution: int, folder: Path, seed: int = 0) -> SceneDict:
-    """A modelled object with a smooth boundary, and what belongs to it, for a scene in mm.
-    `name`, `resolution`: as in `train_modelled`. `seed`: of everything uneven about it."""
-    if name == "candle":
-        return candle_parts(folder, resolution, seed)
-    result = make_varying(name, resolution, max(round(GRID * resolution), 8), seed)
-    return learnable_parts(result, folder)
-
-
 def _scanned(task: Task) -> dict[str, object]:
     prepare()
     p = task.params
     return trained(task, scan_scene(p["material"], 16, "even sky", p["scan"]), p["scan"])
-
-
-def _modelled(task: Task) -> dict[str, object]:
-    prepare()
-    p, name = task.params, task.params["object"]
-    shown = object_parts(name, p["resolution"], check_folder(task.folder), p["seed"])
-    scene = {"type": "scene", "integrator": {"type": "bssrdf"}, **shown}
-    return trained(task, scene, name)
 
 
 def trained(task: Task, scene: SceneDict, name: str) -> dict[str, object]:

@@ -21,7 +21,7 @@ from halfspace_sss.checks import check_choice, check_interval
 from halfspace_sss.progress import Progress
 
 QUALITIES = ("draft", "paper")
-COMPUTING = ("analytic_models", "figures/computing", "figures/modelling", "full_geometry", "halfspace_sss")
+COMPUTING = ("analytic_models", "figures/computing", "full_geometry", "halfspace_sss")
 Params = Mapping[str, Any]  # parameters, or numbers, of a part
 Row = dict[str, float | str | None]  # of a table
 SceneDict = dict[str, Any]  # a scene, or a part of it, as `mitsuba.load_dict` takes it

@@ -9,9 +9,9 @@ pytest.importorskip("mitsuba")
 
 from benchmarks.gathered_error import off  # noqa: E402
 from benchmarks.hand_and_ribbon import SHAPES  # noqa: E402
+from benchmarks.modelling.meshes import surface  # noqa: E402
 from benchmarks.speeds import PASSES, LitObject, Measuring, _noise, ways_of  # noqa: E402
 from benchmarks.timed import TimedRender  # noqa: E402
-from figures.modelling.meshes import surface  # noqa: E402
 
 
 def test_noise_holds_light_that_most_pixels_have_not_met() -> None:

@@ -14,13 +14,8 @@ pytest.importorskip("flip_evaluator")
 
 import benchmarks.__main__  # noqa: E402, F401 - its figures
 from benchmarks.methods import VOLUMES  # noqa: E402
-from benchmarks.published import (  # noqa: E402
-    distant_light,
-    fig07,
-    fig11,  # noqa: E402
-    table1,
-)
-from figures import fig01, fig06, fig09  # noqa: E402
+from benchmarks.published import distant_light, fig01, fig07, fig11, table1  # noqa: E402
+from figures import fig06, fig09  # noqa: E402
 from figures.computing import learnt  # noqa: E402
 from figures.computing import scans as scenes
 from figures.computing.contenders import OF_OBJECTS  # noqa: E402

@@ -11,8 +11,8 @@ dr = pytest.importorskip("drjit")
 mi = pytest.importorskip("mitsuba")
 pytest.importorskip("igl")
 
+from benchmarks.modelling.meshes import Box, surface  # noqa: E402
 from benchmarks.random_shapes import make_shape  # noqa: E402
-from figures.modelling.meshes import Box, surface  # noqa: E402
 from full_geometry.geometry.points import SurfacePoint, cosine_direction  # noqa: E402
 from full_geometry.learning.model_errors import errors_of, transport_of  # noqa: E402
 from full_geometry.objects.objects import TranslucentObject, object_of  # noqa: E402

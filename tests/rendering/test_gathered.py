@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from benchmarks.modelling.meshes import Box, surface
 from benchmarks.random_shapes import box
-from figures.modelling.meshes import Box, surface
 from full_geometry.geometry.light_points import SurfacePoints, uniform_entries
 from full_geometry.geometry.shape import analyse_shape
 from full_geometry.integrators.fine_light import FineLight, fine_light

@@ -227,7 +227,7 @@ def test_a_ball_in_a_bell_jar_without_absorption_is_invisible_in_uniform_light()
 @pytest.mark.slow
 def test_a_branching_object_without_absorption_is_invisible_in_uniform_light(tmp_path: Path) -> None:
     """A hand about 10 units wide, without interpolated normals, by z-tests beside a bias of .3 %."""
-    meshes = pytest.importorskip("figures.modelling.meshes")
+    meshes = pytest.importorskip("benchmarks.modelling.meshes")
     hands = pytest.importorskip("benchmarks.hand_and_ribbon")
     pytest.importorskip("igl")
     path = meshes.surface(*hands.hand(), 48).write_ply(tmp_path / "hand.ply")

@@ -19,7 +19,7 @@ pytest.importorskip("torch")
 pytest.importorskip("igl")
 
 import full_geometry  # noqa: E402
-from figures.modelling.objects import FLAME_RADIANCE, make_candle  # noqa: E402
+from benchmarks.modelling.objects import FLAME_RADIANCE, make_candle  # noqa: E402
 from full_geometry.geometry.points import (  # noqa: E402
     AreaPoints,  # noqa: E402
     EntrySample,

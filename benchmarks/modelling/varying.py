@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from figures.modelling.meshes import (
+from benchmarks.modelling.meshes import (
     Box,
     cells,
     cut,

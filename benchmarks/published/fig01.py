@@ -9,20 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from benchmarks.modelling.learnt import object_parts, train_modelled
+from benchmarks.modelling.objects import TISSUES, tissue
 from figures.computing.contenders import COMPILING, NOTE, OF_OBJECTS, against, reference_image, reference_shot
 from figures.computing.images import Shot
-from figures.computing.learnt import (
-    CHUNKS,
-    FULL_GEOMETRY,
-    object_parts,
-    train_modelled,
-    training_of,
-    weight_files,
-    with_weights,
-)
+from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, training_of, weight_files, with_weights
 from figures.computing.scans import environment, environment_file, prepare
 from figures.drawing.image_grid import image_files, label, rows_of
-from figures.modelling.objects import TISSUES, tissue
 from figures.parts.part import Part, Result, SceneDict, Task
 
 TITLE = "candle with its flame, mandarin and croissant, path traced and by models, light gathered and corrected"

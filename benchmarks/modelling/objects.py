@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from figures.modelling import varying
-from figures.modelling.meshes import (
+from benchmarks.modelling import varying
+from benchmarks.modelling.meshes import (
     Box,
     Mesh,
     capsule,

@@ -12,9 +12,9 @@ igl = pytest.importorskip("igl")
 
 import mitsuba as mi  # noqa: E402
 
+from benchmarks.modelling import meshes, objects  # noqa: E402
 from benchmarks.published import meat  # noqa: E402, F401  # an object more
 from figures.computing import scans as scenes  # noqa: E402
-from figures.modelling import meshes, objects  # noqa: E402
 
 LOW, HIGH = 32, 64
 CELLS = 24
