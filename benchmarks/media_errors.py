@@ -11,12 +11,12 @@ import pandas
 import typer
 from rich.table import Table
 
+from benchmarks.universal_training import draw_media
 from halfspace_sss import materials
 from halfspace_sss.checks import check_count
 from halfspace_sss.cli import shared
 from halfspace_sss.cli.errors import SQUARE, ReferenceOptions, channels_of, compared, percent_table
 from halfspace_sss.comparison.model_errors import HELD_OUT_SEED, percentiles
-from halfspace_sss.maps.grid import draw_media
 from halfspace_sss.physics.medium import Medium
 
 BANDS: dict[str, Callable[[pandas.DataFrame], pandas.Series]] = {

@@ -24,14 +24,14 @@ from torch import nn
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.comparison.sampled_exits import exits
-from halfspace_sss.maps.grid import draw_media
 from halfspace_sss.maps.noisy_maps import CellGrid, Groups, draw_directions, load_maps, make_pool
 from halfspace_sss.neural.network import (
+    GRAZING,
     LOG_RANGE,
     N_FEATURES,
     N_MEDIUM,
+    N_POLYNOMIALS,
     N_TERMS,
-    calibration_terms,
     layer_shapes,
     medium_features,
 )
@@ -107,6 +107,32 @@ class Hyper(nn.Module):
             layers |= {f"medium_{k}_W": W, f"medium_{k}_b": b}
         arrays = {**layers, "base": self.base, "basis": self.basis}
         return {name: value.detach().numpy().astype(np.float16) for name, value in arrays.items()}
+
+
+LEAST_ABSORPTION = 1e-5  # 1 - albedo of the log-uniform half
+
+
+def draw_media(
+    n: int, rng: np.random.Generator, steep_share: float = 1 / 3
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """albedo, g and eta of n media.
+
+    albedo: half uniform, half log-uniform in 1 - albedo down to 1e-5, one in fifty exactly 1. g: uniform, but for
+    `steep_share` log-uniform in 1 - g below 0.5. eta: uniform, one in ten exactly 1.
+    """
+    u = rng.random((6, n))
+    (a_0, a_1), (g_0, g_1), (e_0, e_1) = RANGES["albedo"], RANGES["g"], RANGES["eta"]
+    albedo = np.where(u[0] < 0.5, a_0 + (a_1 - a_0) * u[1], 1 - LEAST_ABSORPTION ** u[1])
+    albedo = np.where(u[0] > 0.98, 1.0, albedo)
+    g = np.where(u[2] < 1 - steep_share, g_0 + (g_1 - g_0) * u[3], 1 - 0.5 * ((1 - g_1) / 0.5) ** u[3])
+    eta = np.where(u[4] < 0.1, 1.0, e_0 + (e_1 - e_0) * u[5])
+    return albedo, g, eta
+
+
+def calibration_terms(mu: np.ndarray, mu_in: np.ndarray) -> np.ndarray:
+    """What `log_calibration` has for each coefficient, the last axis."""
+    polynomials = np.polynomial.chebyshev.chebvander(2 * np.asarray(mu) - 1, N_POLYNOMIALS - 1)
+    return np.concatenate([polynomials, *((s / (s + mu_in))[..., None] for s in GRAZING)], axis=-1)
 
 
 class Fluxes(NamedTuple):

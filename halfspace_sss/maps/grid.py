@@ -9,7 +9,6 @@ import numpy as np
 
 from halfspace_sss.arrays import library
 from halfspace_sss.checks import check_count
-from halfspace_sss.neural.universal import RANGES
 from halfspace_sss.physics.backbone import length_scale, unwarp, warp
 from halfspace_sss.physics.medium import Medium
 
@@ -73,23 +72,3 @@ def map_directions(medium: Medium, grid: MapGrid, seed: int) -> tuple[np.ndarray
     strata = np.stack([rng.permutation(grid.n_phi) for _ in range(2 * grid.n_theta)]).reshape(2, *shape)
     u = (strata + rng.uniform(0.1, 0.9, strata.shape)) / grid.n_phi
     return mu_i, lowest + (1 - lowest) * u[0], 2 * math.pi * u[1] - math.pi
-
-
-LEAST_ABSORPTION = 1e-5  # 1 - albedo of the log-uniform half
-
-
-def draw_media(
-    n: int, rng: np.random.Generator, steep_share: float = 1 / 3
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """albedo, g and eta of n media.
-
-    albedo: half uniform, half log-uniform in 1 - albedo down to 1e-5, one in fifty exactly 1. g: uniform, but for
-    `steep_share` log-uniform in 1 - g below 0.5. eta: uniform, one in ten exactly 1.
-    """
-    u = rng.random((6, n))
-    (a_0, a_1), (g_0, g_1), (e_0, e_1) = RANGES["albedo"], RANGES["g"], RANGES["eta"]
-    albedo = np.where(u[0] < 0.5, a_0 + (a_1 - a_0) * u[1], 1 - LEAST_ABSORPTION ** u[1])
-    albedo = np.where(u[0] > 0.98, 1.0, albedo)
-    g = np.where(u[2] < 1 - steep_share, g_0 + (g_1 - g_0) * u[3], 1 - 0.5 * ((1 - g_1) / 0.5) ** u[3])
-    eta = np.where(u[4] < 0.1, 1.0, e_0 + (e_1 - e_0) * u[5])
-    return albedo, g, eta

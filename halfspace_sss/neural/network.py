@@ -227,12 +227,6 @@ def log_calibration(c: Sequence[Real], mu: Real, mu_in: Real) -> Real:
     return c[0] + 0.5 * twice * last - after + grazing
 
 
-def calibration_terms(mu: np.ndarray, mu_in: np.ndarray) -> np.ndarray:
-    """What `log_calibration` has for each coefficient, the last axis."""
-    polynomials = np.polynomial.chebyshev.chebvander(2 * np.asarray(mu) - 1, N_POLYNOMIALS - 1)
-    return np.concatenate([polynomials, *((s / (s + mu_in))[..., None] for s in GRAZING)], axis=-1)
-
-
 def log_calibrations(c: Sequence[Real], q: Query) -> Real:
     """log a(mu_i) a(mu_o) of a query, see `log_calibration`."""
     return log_calibration(c, q.mu_i, q.mu_i_in) + log_calibration(c, q.mu_o, q.mu_o_in)

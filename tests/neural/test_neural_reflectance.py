@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from benchmarks.truths import Truth, read_truths
+from benchmarks.universal_training import calibration_terms
 from halfspace_sss import Medium, bssrdf, trace
 from halfspace_sss.comparison.sampled_exits import exits, sampled_reflectance
-from halfspace_sss.neural.network import N_TERMS, calibration_terms, log_calibration
+from halfspace_sss.neural.network import N_TERMS, log_calibration
 from halfspace_sss.neural.universal import in_range, load_hypernetwork, shipped_weights
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.fresnel import F_r, mu_internal

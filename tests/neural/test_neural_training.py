@@ -15,10 +15,9 @@ import pytest
 import torch
 
 import halfspace_sss
-from benchmarks.universal_training import Hyper, UniversalRecipe, train_universal
+from benchmarks.universal_training import Hyper, UniversalRecipe, draw_media, train_universal
 from halfspace_sss import Medium, materials
 from halfspace_sss.comparison.model_errors import ReferenceSize, TracedMaps, model_error, reference_maps
-from halfspace_sss.maps.grid import draw_media
 from halfspace_sss.maps.noisy_maps import CellGrid, draw_directions, make_pool
 from halfspace_sss.neural.training.fit import Fit, Source, fit
 from halfspace_sss.neural.training.learners import MapPool, PaperLearner, Small

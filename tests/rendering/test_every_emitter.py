@@ -317,7 +317,10 @@ def test_emitters_that_fail_in_symbolic_loops_are_refused_by_name(integrator: st
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
-        ("sky", "to_world of emitter 'sky' must turn it, and axes of rotations have the length 1, got scales from 1.19"),
+        (
+            "sky",
+            "to_world of emitter 'sky' must turn it, and axes of rotations have the length 1, got scales from 1.19",
+        ),
         ("ball", "to_world of object 'object' must not stretch it, .* got scales from 1 to 2"),
     ],
 )
