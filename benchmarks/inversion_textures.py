@@ -22,7 +22,7 @@ from full_geometry import inverse
 from full_geometry.geometry.mesh import vertex_positions
 from full_geometry.inverse.views import GivenView
 from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
-from full_geometry.trade.image_differences import mean_flip
+from full_geometry.trade.image_differences import flip_ldr, luminance, srgb
 from halfspace_sss.progress import NamedProgress
 
 THINGS = ("bunny", "ball")
@@ -140,3 +140,14 @@ def _scene(thing: SceneDict, size: int, model: str, lamp: list[float]) -> SceneD
         view = at.look_at(eye, CENTRE, [0, 1, 0])
         scene[f"view{k}"] = {"type": "perspective", "fov": 25.0, "to_world": view, "film": film}
     return scene
+
+
+WHITE = 0.9  # encoded luminance of the bright end
+BRIGHT = 99.0  # percentile that comes out there
+
+
+def mean_flip(reference: np.ndarray, test: np.ndarray) -> float:
+    """Mean LDR-FLIP of two images, both exposed so that the bright end of the reference is nearly white."""
+    level = float(np.percentile(luminance(reference), BRIGHT))
+    exposure = float(np.log2(WHITE / level)) if level > 0 else 0.0
+    return flip_ldr(srgb(reference, exposure), srgb(test, exposure)).mean

@@ -88,7 +88,7 @@ def _name(material: str, shape: str, light: str) -> str:
 def measured(task: Task) -> dict[str, object]:
     """The assessment of a scene, and an image by each way."""
     from full_geometry.trade.assessing import assess_stage
-    from full_geometry.trade.images import small_images, with_flip
+    from full_geometry.trade.images import small_images
     from full_geometry.trade.techniques import Effort, stage
 
     prepare()
@@ -105,7 +105,6 @@ def measured(task: Task) -> dict[str, object]:
         named = {row.way for row in result.objects[0].ways if not row.refusal}
         shown = [way for way in chosen if way.name in named]
         images = small_images(on, shown, 0, p["seed"], p["size"], p["spp"])
-        result = with_flip(on, shown, result, 0, p["seed"], images, p["spp"])
     numbered = {f"image_{k}": image for k, image in enumerate(images.values())}
     return {"assessment": result.record(), "seconds": p["seconds"], "shown": list(images), **numbered}
 

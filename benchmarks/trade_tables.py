@@ -109,7 +109,7 @@ def trade_table(scenes: Scenes) -> pandas.DataFrame:
             row |= {"bias_standard_error": w.bias_error, "bias2": w.bias2, "bias2_standard_error": w.bias2_error}
             row["variance"] = w.variance
             row |= {"seconds_per_million": 1e6 * w.seconds, "cost": 1e6 * w.cost}
-            rows.append(row | {"flip": w.flip, "flip_noise": w.flip_noise})
+            rows.append(row)
     return pandas.DataFrame(rows)
 
 

@@ -103,11 +103,10 @@ def object_table(assessed: ObjectTrade) -> Table:
     low, high = assessed.mfp
     title = f"{assessed.object or UNNAMED}: {low:.3g} to {high:.3g} mean free paths, {100 * assessed.share:.3g} % seen"
     rows = [_row(row) for row in assessed.ways if not row.refusal]
-    return shared.table([*HEADINGS, "mean / traced", "preparation, s", "memory, MB", "FLIP"], rows, title=title)
+    return shared.table([*HEADINGS, "mean / traced", "preparation, s", "memory, MB"], rows, title=title)
 
 
 def _row(row: TechniqueTrade) -> list[str]:
     cost = (f"{row.variance:.3g}", f"{1e6 * row.seconds:.3g}", f"{1e6 * row.cost:.3g}")
     means = " ".join(f"{value:.3f}" for value in row.ratio)
-    flip = "–" if row.flip is None else f"{row.flip:.3f}"
-    return [row.way, row.told_bias, *cost, means, f"{row.preparation:.2g}", f"{row.memory / 1e6:.3g}", flip]
+    return [row.way, row.told_bias, *cost, means, f"{row.preparation:.2g}", f"{row.memory / 1e6:.3g}"]

@@ -120,7 +120,7 @@ def recommend(
         return advise(scene, job)
     if "assess_seconds" in assessing:
         assessing["seconds"] = assessing.pop("assess_seconds")
-    return advise(assess(scene, job=job, seed=seed, **{"flip": False, **assessing}), job)
+    return advise(assess(scene, job=job, seed=seed, **assessing), job)
 
 
 def advise(assessment: Assessment, job: Job) -> Advice:

@@ -22,7 +22,6 @@ from full_geometry.scenes.reference import check_sensor
 from full_geometry.scenes.scene_files import PATH_TRACED, first_cause
 from full_geometry.trade.denoised_walks import KNOWN as KNOWN_ERROR
 from full_geometry.trade.denoised_walks import Walked, denoised_rows
-from full_geometry.trade.images import with_flip
 from full_geometry.trade.measuring import SceneSamples, light_variance
 from full_geometry.trade.results import Assessment, ObjectTrade, TechniqueTrade, samples_for
 from full_geometry.trade.sampling import Sampled
@@ -64,7 +63,6 @@ def assess(
     *,
     models: Sequence[str] | None = None,
     job: Job | None = None,
-    flip: bool = True,
     parameters: dict[str, str] | None = None,
     train_seconds: float = 0.0,
     progress: NamedProgress | None = None,
@@ -82,7 +80,6 @@ def assess(
         models: names of techniques, such as "neural" or "neural, gathered", which are all measured; by default all,
             or for a job those of `CANDIDATES` that might be the cheapest for it. "path_traced" is always among them.
         job: most of the time is then for walks and for techniques that might be the cheapest to keep its tolerance.
-        flip: whether to render small images for FLIP, if the evaluator is installed.
         parameters: values of the parameters $name of an XML file.
         train_seconds: that each object without weights is learnt for before, as `train object` does; 0 for what has
             been learnt. The time of a training is a cost of its model.
@@ -109,10 +106,8 @@ def assess(
     if train_seconds > 0:
         learn(on, train_seconds, how.seed, progress)
     if job is None:
-        result = assess_stage(on, chosen, how, progress)
-    else:
-        result = assess_for(on, chosen, job, how, progress, every=bool(models))
-    return with_flip(on, chosen, result, how.sensor, how.seed) if flip else result
+        return assess_stage(on, chosen, how, progress)
+    return assess_for(on, chosen, job, how, progress, every=bool(models))
 
 
 def assess_stage(

@@ -45,7 +45,7 @@ from halfspace_sss.provenance import provenance, write_atomically
 ENVIRONMENT_VARIABLE = "HALFSPACE_SSS_CHOICES"
 DEFAULT = "neural"
 UNNAMED = (*(way.name for way in WALKED), f"{READY_FIRST}, {CORRECTED}")  # where nothing names a model
-FORMAT = "halfspace-sss choice 5"
+FORMAT = "halfspace-sss choice 6"
 
 
 def choices_folder() -> Path:

@@ -1,10 +1,9 @@
-"""Small images of a scene by each way, and how different they look: FLIP."""
+"""Small images of a scene by each way."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from importlib.util import find_spec
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +13,6 @@ import numpy as np
 
 from full_geometry.geometry.points import floats
 from full_geometry.geometry.sensors import independent, seeded
-from full_geometry.scenes.scene_files import PATH_TRACED
-from full_geometry.trade.image_differences import mean_flip
 from full_geometry.trade.results import Assessment
 from full_geometry.trade.sampling import radiance
 from full_geometry.trade.techniques import Stage, Technique, stage
@@ -83,36 +80,6 @@ def pixels_of(size: Sequence[int], corner: Sequence[int] = (0, 0)) -> np.ndarray
     """x and y of the pixels of a window (n, 2), row by row."""
     y, x = np.mgrid[: size[1], : size[0]]
     return np.stack([x.ravel() + corner[0], y.ravel() + corner[1]], axis=1)
-
-
-def with_flip(
-    on: Stage,
-    chosen: Sequence[Technique],
-    assessment: Assessment,
-    sensor: int,
-    seed: int,
-    images: Mapping[str, np.ndarray] | None = None,
-    spp: int = SPP,
-) -> Assessment:
-    """The assessment with FLIP of the whole small image, where the evaluator is installed and something shines.
-    `chosen`: ways, path traced first. `images`: of `small_images`, if they have been rendered, with `spp` samples a
-    pixel."""
-    if find_spec("flip_evaluator") is None or all(o.is_dark for o in assessment.objects):
-        return assessment
-    measured = {PATH_TRACED, *(w.way for o in assessment.objects for w in o.ways if not w.refusal)}
-    shown = [
-        technique for technique in chosen if technique.name in measured
-    ]  # others would gather light for a number that is not told
-    images = small_images(on, shown, sensor, seed, spp=spp) if images is None else images
-    truth = images[PATH_TRACED]
-    again = small_images(on, [chosen[0]], sensor, seeded(seed, 52), max(truth.shape), spp)[PATH_TRACED]
-    noise = mean_flip(truth, again)
-    values = {name: noise if name == PATH_TRACED else mean_flip(truth, image) for name, image in images.items()}
-    objects = []
-    for o in assessment.objects:
-        rows = tuple(replace(w, flip=values.get(w.way), flip_noise=noise) if not w.refusal else w for w in o.ways)
-        objects.append(replace(o, ways=rows))
-    return replace(assessment, objects=tuple(objects))
 
 
 # --------------------------------------------------------------------------------------------------

@@ -37,8 +37,6 @@ class TechniqueTrade:
         preparation, compilation: seconds, once for a scene; kernels that were compiled before are found again.
         training: seconds, once for an object; 0 for what needs none.
         memory: most bytes that Dr.Jit held in a launch.
-        flip, flip_noise: mean FLIP of a small image against that of walks, and of two images of walks; None if the
-            evaluator is not installed.
         refusal: why it could not be assessed; all numbers are nan then.
     """
 
@@ -57,8 +55,6 @@ class TechniqueTrade:
     memory: int = 0
     power: float = 1.0
     of_image: float = 0.0
-    flip: float | None = None
-    flip_noise: float | None = None
     refusal: str = ""
 
     @property
@@ -213,7 +209,7 @@ class Assessment:
                 row |= {"variance": w.variance, "variance_standard_error": w.variance_error}
                 row |= {"seconds_per_million": 1e6 * w.seconds, "samples": w.samples, "preparation_s": w.preparation}
                 row |= {"compilation_s": w.compilation, "training_s": w.training, "memory_MB": w.memory / 1e6}
-                row |= {"flip": w.flip, "flip_noise": w.flip_noise, "refusal": w.refusal}
+                row |= {"refusal": w.refusal}
                 rows.append(row)
         return pandas.DataFrame(rows)
 
@@ -226,4 +222,4 @@ def _known(key: str, value: object) -> object:
     """A field of a `TechniqueTrade` from JSON."""
     if key in ("ratio", "ratio_error"):
         return tuple(math.nan if v is None else v for v in value)
-    return math.nan if value is None and key not in ("flip", "flip_noise") else value
+    return math.nan if value is None else value

@@ -346,6 +346,6 @@ def test_derivatives_by_a_thing_inside_are_refused_by_name(trained: Trained) -> 
 def test_errors_and_trade_know_the_models_that_take_what_lies_inside(trained: Trained) -> None:
     loaded = untrainable(both())
     assert {row.model for row in ObjectLearner().errors(loaded, exits=16)} == {"full_geometry"}
-    found = assess(loaded, models=["neural", "full_geometry"], seconds=0.4, flip=False, exits=32).objects[0]
+    found = assess(loaded, models=["neural", "full_geometry"], seconds=0.4, exits=32).objects[0]
     assert found.way("full_geometry").bias < 0.1 and not found.way("full_geometry").refusal
     assert "must be empty for the model 'neural', got the shape 'stone'" in found.way("neural").refusal

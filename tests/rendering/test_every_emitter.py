@@ -355,7 +355,7 @@ def _under_a_point_light(shape: str) -> dict:
 def test_light_that_is_blurred_under_a_point_light_is_stated_and_nothing_is_called_exact(shape: str) -> None:
     """All orders; the object is tens of mean free paths across."""
     scene = mi.load_dict(_under_a_point_light(shape))
-    advice = recommend(scene, tolerance=0.05, assess_seconds=1.0, models=["lambert"], flip=False)
+    advice = recommend(scene, tolerance=0.05, assess_seconds=1.0, models=["lambert"])
     assert advice.objects[0].way == "path_traced" and "exact" not in str(advice)
     traced = advice.assessment.objects[0].traced
     # a machine that is busy takes few samples in the time, and then the bound is of noise alone

@@ -26,7 +26,7 @@ from halfspace_sss import Medium
 from halfspace_sss.physics.fresnel import F_r
 
 mi = pytest.importorskip("mitsuba")
-QUICK = {"seconds": 0.2, "flip": False, "exits": 64}
+QUICK = {"seconds": 0.2, "exits": 64}
 FEW = ["better_dipole", "lambert"]
 
 
