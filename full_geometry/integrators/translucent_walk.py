@@ -40,7 +40,7 @@ from full_geometry.settings import MM_PER_UNIT, OF_MITSUBA, WALK_LIGHTS, check_d
 from full_geometry.surface.textured import shown
 from full_geometry.surface.varying import equivalent
 from full_geometry.surface.wrapped import surface_of
-from full_geometry.walk.emitter_connections import EmitterDirections, InnerLights, find_connections
+from full_geometry.walk.emitter_connections import InnerLights, find_connections, find_directions
 from full_geometry.walk.media import WalkMedia
 from full_geometry.walk.random_walk import PATH_LANES, on_device
 from full_geometry.walk.scores import PathScores, with_derivatives
@@ -160,7 +160,7 @@ def _class(variant: str) -> type:
             # ---- or sampled: connections with small emitters, directions to them, straight light
             else:
                 connections, light = find_connections(scene, media, small, self.connection_share, scored), None
-                directions = connections and EmitterDirections(scene, media, small, scored)
+                directions = find_directions(scene, media, small, self.connection_share, scored)
                 if scored and inner is not None:
                     raise ValueError("objects must hold no delta lights for derivatives of translucent_walk")
                 straight = find_straight_light(scene, media, self.max_depth == FOREVER, scored)

@@ -10,7 +10,9 @@ index 1 are no vertices (`straight_light`).
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -253,26 +255,32 @@ class LightVisitor:
             departure = Departure(event.p, event.along, record.departure.ahead, walk.object)
             record = replace(record, sighted=sees, departure=departure, delta=record.delta | sees)
             walk, record, _ = dr.if_stmt((walk, record, event), sees, self._see, _same_state, label="emitters")
-        if self.connections is None:
+        if self.directions is None:
             return walk, record, mi.Spectrum(0)
-
-        # ---- connections with light subpaths; where the edge to the last event was straight, they find the rest of it
-        smooth = self.media.connects(walk.object)
-        edge = record.straight & smooth & (walk.order > 0)  # this event ends one
-        connected = record.connected | edge
-        record = replace(record, connected=connected, pivot=dr.select(edge, record.departure.p, record.pivot))
-        connects, L = smooth & (walk.order + 2 <= self.media.row("most", walk.object)), record.L
-        if self.outgoing is not None:
-            connects &= ~record.shallow
-        walk, record, _ = dr.if_stmt((walk, record, event), connects, self._connect, _same_state, label="connections")
+        L, connected = record.L, record.connected
+        if self.connections is not None:
+            walk, record = self._connected(walk, record, event)
+            connected = record.connected
         met = record.L - L
 
         # ---- directions to emitters, where no connection finds their light, with MIS weights against phase sampling
-        directed = smooth & ~connected & self.media.counts(walk.object, walk.order + 1)
+        directed = self.directions.leads(walk.object) & ~connected & self.media.counts(walk.object, walk.order + 1)
         record = replace(record, straight=mi.Bool(True), directed=directed)
         walk, record, _ = dr.if_stmt((walk, record, event), directed, self._direct, _same_state, label="directions")
         departure = Departure(event.p, event.along, record.departure.ahead, walk.object)
         return walk, replace(record, departure=departure), met
+
+    def _connected(self, walk: Walk, record: LightRecord, event: Event) -> tuple[Walk, LightRecord]:
+        """The walk and its record with light of connections.
+        Where the edge to the last event was straight, they find the rest of its light."""
+        smooth = self.media.connects(walk.object)
+        edge = record.straight & smooth & (walk.order > 0)  # this event ends one
+        connected = record.connected | edge
+        record = replace(record, connected=connected, pivot=dr.select(edge, record.departure.p, record.pivot))
+        connects = smooth & (walk.order + 2 <= self.media.row("most", walk.object))
+        if self.outgoing is not None:
+            connects &= ~record.shallow
+        return dr.if_stmt((walk, record, event), connects, self._connect, _same_state, label="connections")[:2]
 
     def _all_light(self, walk: Walk, record: LightRecord, event: Event) -> tuple[Walk, LightRecord]:
         """Precomputed light of an event: unscattered, and of a few events on all, with which the walk ends."""
@@ -313,8 +321,16 @@ class LightVisitor:
             left = left * dr.select(record.shallow, self._part(walk, record), 1)
         else:
             active = active & ~record.shallow if self.deep else active
-        light = self.sampled_emitter(walk, si, self.media.boundary(walk.object), active & (dr.max(dr.abs(left)) > 0))
+        active = active & (dr.max(dr.abs(left)) > 0)
+        share = None if self.directions is None else partial(self._sampled_share, walk, record)
+        light = self.sampled_emitter(walk, si, self.media.boundary(walk.object), active, share=share)
         return walk, replace(record, L=record.L + left * light)
+
+    def _sampled_share(self, walk: Walk, record: LightRecord, ds: mi.DirectionSample3f, active: mi.Bool) -> mi.Float:
+        """MIS weight of light that is sampled at a rough boundary, against directions from the last event."""
+        departure = replace(record.departure, ahead=mi.Vector3f(walk.d))
+        which = self.small.index_of(ds.emitter, ds.d)
+        return self._against_directions(which, departure, walk.medium, mi.Float(1), active & record.directed)
 
     @property
     def others(self) -> bool:
@@ -379,7 +395,7 @@ class LightVisitor:
         # ---- index 1: the last vertex is still the event
         if self.straight_light is not None:
             record = self._from_event(walk, record, before, crossing)
-        if self.connections is None:
+        if self.directions is None:
             return walk, record
 
         # ---- refracted straight from the event: connections and directions to emitters have seen this way
@@ -415,12 +431,12 @@ class LightVisitor:
         weight = dr.select(record.delta, 1, mis_weight(record.pdf, pdf))
 
         # what connections find does not count; directions to emitters have weights of their own
-        if self.connections is not None and self.small.some_met:
+        if self.directions is not None and self.small.some_met:
             which = self.small.index_of(emitter, walk.d)
-            active &= ~(record.connected & self.connections.covers(which, si.p, walk.d, record.pivot))
+            if self.connections is not None:
+                active &= ~(record.connected & self.connections.covers(which, si.p, walk.d, record.pivot))
             directed = active & record.directed
-            state = (which, record.departure, walk.medium, weight, directed)
-            _, _, _, weight, _ = dr.if_stmt(state, directed, self._against_directions, lambda *state: state)
+            weight = self._against_directions(which, record.departure, walk.medium, weight, directed)
         return walk.weight * left * emission(emitter, si, weight, active)
 
     @property
@@ -498,9 +514,15 @@ class LightVisitor:
         return dr.select(found, emitter.eval(met, found), 0), active & ~met.is_valid()
 
     def _against_directions(
-        self, which: mi.Int32, departure: Departure, medium: WalkMedium, share: mi.Float, directed: mi.Bool
-    ) -> tuple:
-        return which, departure, medium, self.directions.share(which, departure, directed, medium), directed
+        self, which: mi.Int32, departure: Departure, medium: WalkMedium, weight: mi.Float, directed: mi.Bool
+    ) -> mi.Float:
+        """The weight, times that against directions from the last event where such were sampled."""
+
+        def shared(weight: mi.Float, *state: Any) -> tuple:
+            return weight * self.directions.share(*state[:2], state[3], state[2]), *state
+
+        state = (weight, which, departure, medium, directed)
+        return dr.if_stmt(state, directed, shared, lambda *state: state)[0]
 
     def spread_lights(self, walk: Walk, record: LightRecord, active: mi.Bool) -> mi.Spectrum:
         """Light of a delta light whose cone holds the ray, where no other strategy finds it."""
@@ -524,9 +546,7 @@ class LightVisitor:
         L = self.small.spread(which, ray, radius, active)
         if self.connections is not None:
             directed &= dr.max(L) > 0
-            state = (which, record.departure, walk.medium, mi.Float(1), directed)
-            _, _, _, share, _ = dr.if_stmt(state, directed, self._against_directions, lambda *state: state)
-            L = L * share
+            L = L * self._against_directions(which, record.departure, walk.medium, mi.Float(1), directed)
         return dr.select(active, walk.weight * L * n * left, 0)
 
     def spread_inner_lights(self, walk: Walk, active: mi.Bool) -> mi.Spectrum:
@@ -546,10 +566,15 @@ class LightVisitor:
         bsdf: mi.BSDFPtr,
         active: mi.Bool,
         outwards: mi.Bool | bool = True,
+        share: Callable[[mi.DirectionSample3f, mi.Bool], mi.Float] | None = None,
     ) -> mi.Spectrum:
-        """Light of a sampled emitter by the surface at `si`; by a boundary only from its outer side."""
-        u = mi.Point2f(walk.rng.next_float32(), walk.rng.next_float32())
-        return walk.weight * next_event(self.scene, self.media.instance_scene, (si, bsdf), u, active, outwards)
+        """Light of a sampled emitter by the surface at `si`; by a boundary only from its outer side.
+        `share`: as of `next_event`."""
+        u, scenes = (
+            mi.Point2f(walk.rng.next_float32(), walk.rng.next_float32()),
+            (self.scene, self.media.instance_scene),
+        )
+        return walk.weight * next_event(*scenes, (si, bsdf), u, active, outwards, share=share)
 
 
 def _same_state(*state: object) -> tuple:

@@ -215,6 +215,22 @@ class SmallEmitters:
             d, light = dr.select(sun, way, d), dr.select(sun, L, light)
         return d, distance, light
 
+    def pdf(
+        self, k: mi.UInt32, at: mi.Interaction3f, w: mi.Vector3f, met: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> mi.Float:
+        """Density of w by `sample`, 1/sr, where the ray along w meets `met`; 0 of a delta light."""
+        n, density = len(self.emitters), mi.Float(0)
+        if self.some_met and n > self.n_delta:
+            there = active & met.is_valid() & (mi.UInt32(k) >= self.n_delta) & (mi.UInt32(k) < n)
+            there &= self.index_of(met.emitter(self.scene, there), w) == mi.Int32(k)
+            emitter = self._emitter(dr.minimum(k, n - 1) if self.suns else k)
+            density = dr.select(there, emitter.pdf_direction(at, mi.DirectionSample3f(self.scene, met, at), there), 0)
+        if self.suns:
+            radius = self._row("radius", k)
+            sun = (mi.UInt32(k) >= n) & _within(w, self._centre(k), radius)
+            density = dr.select(sun, 1 / _solid_angle(radius), density)
+        return density
+
     def _emitter(self, k: mi.UInt32) -> mi.Emitter | mi.EmitterPtr:
         if len(self.emitters) == 1:
             return self.emitters[0]
@@ -318,7 +334,8 @@ def _place(emitter: mi.Emitter) -> tuple[float, float, float, bool, float]:
     shape, at = emitter.get_shape(), dr.zeros(mi.Interaction3f)
     if shape is not None:
         box = shape.bbox()
-        centre, radius = box.center(), 0.5 * float(np.linalg.norm(np.array(box.extents())))
+        extents, ball = np.array(box.extents()), shape.class_name() == "Sphere"
+        centre, radius = box.center(), 0.5 * float(extents.max() if ball else np.linalg.norm(extents))
         return (*np.ravel(np.array(centre)).tolist(), False, radius)
     ds, _ = emitter.sample_direction(at, mi.Point2f(0.5))
     far = bool(mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite))

@@ -13,6 +13,8 @@ that are drawn by emitters or by a proposal, must be that of this heuristic; so 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import drjit as dr
 import mitsuba as mi
 
@@ -55,6 +57,7 @@ def sample_emitter(
 def next_event(
     scene: mi.Scene, instance_scene: InstanceScene, surface: tuple[mi.SurfaceInteraction3f, mi.BSDFPtr], u: mi.Point2f,
     active: mi.Bool, outwards: mi.Bool | bool = False, differentiable: bool = False,
+    share: Callable[[mi.DirectionSample3f, mi.Bool], mi.Float] | None = None,
 ) -> mi.Spectrum:  # fmt: skip
     """Next-event estimation at a surface: f(w) |cos| L_e(w) / p_e with its MIS weight against BSDF sampling.
 
@@ -62,8 +65,8 @@ def next_event(
         scene, u, active, differentiable: as of `sample_emitter`.
         instance_scene: what rays meet in the scene.
         surface: a point of a surface and its BSDF.
-        outwards: whether light arrives at its outer side alone, as at a translucent boundary. At a rough one it may
-            come from below the shading normal; then it is refracted from inside, by the opposite direction.
+        outwards: whether light arrives at its outer side alone, as at a translucent boundary.
+        share: of the light along a sampled direction that counts here, where another technique finds it too.
     """
     # w by the emitters of the scene, p_e; delta BSDFs have no value for it
     si, bsdf = surface
@@ -73,13 +76,26 @@ def next_event(
         active &= (ds.pdf > 0) & (~mi.Bool(outwards) | (dr.dot(ds.d, si.n) > 0))
         # V(x, y): nothing between the surface and the emitter
         active &= ~blocked(scene, instance_scene.ray_to_emitter(si, ds, instance_scene.rounding(si)), active)
-        wo = si.to_local(ds.d)
-        below = outwards & (wo.z < 0)
-        active &= ~below | (mi.Frame3f.cos_theta(si.wi) < 0)
     # f |cos| L_e / p_e  p_e / (p_e + p_f); the densities are held in derivatives
-    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, dr.select(below, -wo, wo), active)
+    value, pdf = towards(si, bsdf, ds.d, active, outwards)
     weight = dr.select(ds.delta, 1, mis_weight(ds.pdf, dr.detach(pdf)))
+    if share is not None:
+        weight *= share(ds, active & (dr.max(value * light) > 0))
     return dr.select(active, value * light * weight, 0)
+
+
+def towards(
+    si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, w: mi.Vector3f, active: mi.Bool, outwards: mi.Bool | bool
+) -> tuple[mi.Spectrum, mi.Float]:
+    """f(w) |cos| of a BSDF and its density p_f for light that arrives from w; `outwards` as of `next_event`.
+    At a rough boundary w may be below the shading normal; then it is refracted from inside, by the opposite direction.
+    """
+    with dr.suspend_grad():
+        wo = si.to_local(w)
+        below = outwards & (wo.z < 0)
+        active = active & (~below | (mi.Frame3f.cos_theta(si.wi) < 0))
+    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, dr.select(below, -wo, wo), active)
+    return dr.select(active, value, 0), pdf
 
 
 # ---- Second technique: emitters that a ray meets --------------------------------------------------------------------

@@ -3,7 +3,8 @@
 Three strategies find what random walks from the camera rarely hit through a refracting boundary:
 
 - `SubpathConnections`: a light subpath from an emitter enters the object and is connected with an event of the walk;
-- `EmitterDirections`: from an event, directions about the one that is refracted towards an emitter;
+- `EmitterDirections`: from an event, directions about the one that is refracted towards an emitter, through smooth and
+  rough boundaries;
 - `InnerLights`: delta lights in the medium of an object, sampled at events and surfaces there.
 
 Paths of connections. A path inside an object has scattering events v_1 ... v_n from the camera's side. An edge
@@ -27,6 +28,7 @@ from full_geometry.geometry.points import channel_mean, opaque, opposed, sided
 from full_geometry.geometry.rounding import before, blocked, place_bound, ray_from
 from full_geometry.geometry.shape import pointer_numbers
 from full_geometry.objects.small_emitters import SmallEmitters, spread
+from full_geometry.walk.emission import towards
 from full_geometry.walk.media import Coefficients, WalkMedia, WalkMedium, interaction_of, ray_of
 from full_geometry.walk.random_walk import Event, Walk, draw, eval_phase, fly, free_path, pick, start_walk, turn
 from full_geometry.walk.scores import Score, phase_score
@@ -303,6 +305,11 @@ def find_connections(
 # guess meets the boundary, three times. Directions are then sampled about the guess, from a narrow lobe as wide as the
 # emitter and from wider ones for guesses that are wrong. They are weighted against those of the phase function by the
 # balance heuristic, so that no guess has to be right.
+#
+# A rough boundary refracts a direction d to a lobe of directions w. Light of an emitter j is estimated along d by
+# next-event estimation and by sampling the BSDF at the boundary, both together without bias, and so by both with the
+# weight p(d) / (p(d) + q_j(d)), p the phase function and q_j the lobes about its guess; the rest of 1 is the weight of
+# directions d by q_j, with w by the emitter or by the BSDF (one-sample model of the balance heuristic).
 
 GUESSES = 3
 SHARES = (0.5, 0.3, 0.2)  # of the lobes
@@ -322,13 +329,18 @@ class Departure:
 @dataclass(frozen=True, eq=False)
 class EmitterDirections:
     """Directions from events to small emitters.
-    `scene`: the Mitsuba scene. `media`: its translucent objects. `small`: its small emitters. `scored`: whether light
-    comes with its slopes."""
+    `scene`: the Mitsuba scene. `media`: its translucent objects. `small`: its small emitters. `alpha`: mean roughness
+    of the boundary by object, 0 of a smooth one. `scored`: whether light comes with its slopes."""
 
     scene: mi.Scene
     media: WalkMedia
     small: SmallEmitters
+    alpha: mi.Float
     scored: bool = False
+
+    def leads(self, k: mi.Int32) -> mi.Bool:
+        """Whether directions lead through the boundary of object k: refracting, and nothing inside."""
+        return self.media.connects(k) | self.media.scatters_at(k)
 
     def _guess(
         self, v: mi.Point3f, k: mi.Int32, which: mi.Int32, m: Coefficients, active: mi.Bool
@@ -350,8 +362,10 @@ class EmitterDirections:
             refracted = w * eta_ti + n * (dr.abs(cos_t) - eta_ti * cosine)
             d = dr.normalize(dr.select(cosine > 0, refracted, d))
 
-        # ---- a lobe as wide as the emitter is seen inside: concentration eta² / angle²
-        return d, dr.minimum(dr.square(eta) / dr.maximum(self.small.angle2(which, v), 1e-6), 1e6), valid
+        # ---- a lobe as wide as the emitter is seen inside: concentration eta² / (angle² + ((eta - 1) alpha)²)
+        alpha = dr.gather(mi.Float, self.alpha, self.media.place_of(k))
+        width2 = self.small.angle2(which, v) + dr.square((eta - 1) * alpha)
+        return d, dr.minimum(dr.square(eta) / dr.maximum(width2, 1e-6), 1e6), valid
 
     def light(self, event: Event, rng: mi.PCG32) -> tuple[mi.Spectrum, Score | tuple[()]]:
         """An estimate of the light of small emitters that leaves from an event, per weight of the walk; its slopes."""
@@ -362,29 +376,68 @@ class EmitterDirections:
         guess, concentration, valid = self._guess(v, k, which, m, True)
         d, pdf = _draw_lobe(guess, concentration, rng)
 
-        # ---- where it leaves the object, refracted to w outside, with the transmittance 1 - F
+        # ---- where it meets the boundary
         ray = ray_of(v, d, event.medium)
         ray.maxt = 2 * DEEPEST / dr.min(m.mean_t)
         si = self.media.instance_scene.intersect(self.media.scene, ray, mi.RayFlags.All, active=valid)
         valid &= si.is_valid() & (self.media.index_of(si) == k)
         si = self.media.seen(si, k, d)
-        F, cos_t, eta_it, eta_ti = mi.fresnel(mi.Frame3f.cos_theta(si.wi), self.media.row("eta", k))
-        w = opposed(si.to_world(mi.refract(si.wi, cos_t, eta_ti)), si.n)
-        valid &= (dr.dot(d, si.n) > 0) & (dr.dot(w, si.n) > 0) & (F < 1)
-        way = ray_from(si, w, self.media.instance_scene.rounding(si))
-        outside = self.media.instance_scene.intersect(self.scene, way, mi.RayFlags.All, active=valid)
+        valid &= dr.dot(d, si.n) > 0
 
-        # ---- p(cos) T (1 - F) L / eta² over the mixture density of lobes and phase function (balance heuristic);
-        #      radiance shrinks by eta² on its way out, as the weight of the walk has when it came in
+        # ---- p(cos) T L_i over the mixture density of lobes and phase function (balance heuristic)
         phase = eval_phase(m, dr.dot(event.along, d))
-        factor = (1 - F) * dr.square(eta_ti) / (pdf / n + channel_mean(phase))
         T = self.media.transmittance(k, ray, dr.select(valid, si.t, 0), rng, event.medium)
-        value = phase * T * factor * self.media.tint(k, si, reflects=False)
-        light = dr.select(valid, value * self.small.along(which, way, outside, valid), 0)
+        value = dr.select(valid, phase * T / (pdf / n + channel_mean(phase)), 0)
+        arriving = self._through_smooth(which, k, si, d, valid & self.media.connects(k))
+        if self.media.any_rough:
+            choice, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
+            state = (arriving, which, k, si, choice, u)
+            rough = valid & self.media.scatters_at(k)
+            arriving, *_ = dr.if_stmt(state, rough, self._through_rough, lambda *state: state, label="rough")
+        light = value * arriving
         if not self.scored:
             return light, ()
         cosine = dr.dot(event.along, d)
         return light, Score(mi.Float(0), dr.select(valid, si.t, 0), phase_score(m.g, cosine)) * light
+
+    def _through_smooth(
+        self, which: mi.Int32, k: mi.Int32, si: mi.SurfaceInteraction3f, d: mi.Vector3f, active: mi.Bool
+    ) -> mi.Spectrum:
+        """L_i along d inside of an emitter that is seen through the smooth boundary of object k at `si`."""
+        # (1 - F) L / eta² where d leaves the object, refracted to w: radiance shrinks by eta² on its way out, as the
+        # weight of the walk has when it came in
+        F, cos_t, eta_it, eta_ti = mi.fresnel(mi.Frame3f.cos_theta(si.wi), self.media.row("eta", k))
+        w = opposed(si.to_world(mi.refract(si.wi, cos_t, eta_ti)), si.n)
+        active = active & (dr.dot(w, si.n) > 0) & (F < 1)
+        way = ray_from(si, w, self.media.instance_scene.rounding(si))
+        outside = self.media.instance_scene.intersect(self.scene, way, mi.RayFlags.All, active=active)
+        L = self.small.along(which, way, outside, active) * self.media.tint(k, si, reflects=False)
+        return dr.select(active, (1 - F) * dr.square(eta_ti) * L, 0)
+
+    def _through_rough(
+        self, arriving: mi.Spectrum, which: mi.Int32, k: mi.Int32, si: mi.SurfaceInteraction3f, choice: mi.Float,
+        u: mi.Point2f,
+    ) -> tuple:  # fmt: skip
+        """An estimate of L_i inside of an emitter that is seen through the rough boundary of object k at `si`."""
+        # ---- w by the BSDF with the probability q, the larger the emitter beside the lobe of w, else by the emitter
+        boundary, angle2 = self.media.boundary(k), self.small.angle2(which, si.p)
+        lobe2 = dr.square((self.media.row("eta", k) - 1) * dr.gather(mi.Float, self.alpha, self.media.place_of(k)))
+        delta = mi.UInt32(which) < self.small.n_delta
+        q = dr.select(delta, 0, angle2 / (angle2 + lobe2))
+        by_bsdf = choice < q
+        w, distance, E = self.small.sample(which, si, u)
+        bs, _ = boundary.sample(mi.BSDFContext(), si, choice / dr.maximum(q, 1e-6), u, by_bsdf)
+        w = dr.select(by_bsdf, opposed(si.to_world(bs.wo), si.n), w)
+        active = (~by_bsdf | (bs.pdf > 0)) & (dr.dot(w, si.n) > 0)
+
+        # ---- f(w) |cos| L_e / (q p_f + (1 - q) p_j), of a delta light f E if nothing hides it
+        way = ray_from(si, w, self.media.instance_scene.rounding(si))
+        met = self.media.instance_scene.intersect(self.scene, way, mi.RayFlags.All, active=active)
+        value, p_f = towards(si, boundary, w, active, True)
+        p_j = self.small.pdf(which, si, w, met, active)
+        L = self.small.along(which, way, met, active & ~delta) / dr.maximum(q * p_f + (1 - q) * p_j, 1e-20)
+        hidden = met.is_valid() & (met.t < distance - before(si.p + w * distance, distance))
+        return value * dr.select(delta, dr.select(hidden, 0, E), L), which, k, si, choice, u
 
     def share(self, which: mi.Int32, way: Departure, active: mi.Bool, medium: WalkMedium | tuple[()] = ()) -> mi.Float:
         """Weight of having hit emitter `which`, if >= 0, by the phase function (balance heuristic against `light`)."""
@@ -394,6 +447,26 @@ class EmitterDirections:
         lobes = _lobes(dr.dot(guess, way.ahead), concentration) / len(self.small)
         phase = channel_mean(eval_phase(m, dr.dot(way.along, way.ahead)))
         return phase / (phase + dr.select(active & valid, lobes, 0))
+
+
+def find_directions(
+    scene: mi.Scene, media: WalkMedia, small: SmallEmitters | None, share: float, scored: bool = False
+) -> EmitterDirections | None:
+    """Directions to the small emitters of a scene; None without any, or where no boundary refracts.
+    `share`, `scored`: as of `SubpathConnections`; without connections there are no directions."""
+    if small is None or share == 0 or not (media.any_refracts or media.any_rough):
+        return None
+    alpha = mi.Float([_roughness(media.boundaries[kind]) for kind in media.instance_table.kind])
+    dr.make_opaque(alpha)
+    return EmitterDirections(scene, media, small, alpha, scored)
+
+
+def _roughness(boundary: mi.BSDF) -> float:
+    """The mean of alpha over directions and textures; 0 of a smooth boundary."""
+    parameters = mi.traverse(boundary)
+    keys = [key for key in parameters.keys() if key.startswith("alpha") and not key.endswith("to_uv")]
+    values = [np.mean(np.array(parameters[key])) for key in keys]
+    return float(np.mean(values)) if values else 0.0
 
 
 def _lobes(cosine: mi.Float, concentration: mi.Float) -> mi.Float:

@@ -625,6 +625,10 @@ class WalkMedia:
         """Whether connections go through the boundary of object k: smooth, refracting, and nothing inside."""
         return self._alone(~self.row("rough", k) & ~self.row("straight", k), k)
 
+    def scatters_at(self, k: mi.Int32) -> mi.Bool:
+        """Whether the boundary of object k is rough, and nothing inside."""
+        return self._alone(self.row("rough", k), k)
+
     def straight(self, k: mi.Int32) -> mi.Bool:
         """Whether light goes straight through the boundary of object k: of index 1, and nothing inside."""
         return self._alone(self.row("straight", k), k)

@@ -14,7 +14,7 @@ mi = pytest.importorskip("mitsuba")
 import drjit as dr  # noqa: E402
 
 from full_geometry.objects.small_emitters import SmallEmitters  # noqa: E402
-from full_geometry.walk.emitter_connections import Departure, EmitterDirections  # noqa: E402
+from full_geometry.walk.emitter_connections import Departure, EmitterDirections, find_directions  # noqa: E402
 from full_geometry.walk.media import WalkMedia  # noqa: E402
 from full_geometry.walk.random_walk import Event  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
@@ -41,7 +41,7 @@ def directions() -> EmitterDirections:
     }
     scene = mi.load_dict({"type": "scene", "slab": slab, **lamps})
     media = WalkMedia.of(scene, 1.0)
-    return EmitterDirections(scene, media, SmallEmitters.of(scene))
+    return find_directions(scene, media, SmallEmitters.of(scene), 1.0)
 
 
 def event(media: WalkMedia, lanes: int) -> Event:

@@ -176,6 +176,20 @@ def test_connections_bring_the_light_that_chance_brings_with_less_noise() -> Non
     assert 64 * np.median(joined.var(axis=0)) < 0.05 * 1024 * left_to_chance.var(axis=0).mean()
 
 
+@pytest.mark.parametrize("lit", ["lamp", "point"])
+def test_directions_bring_light_through_a_rough_boundary_that_chance_brings_with_less_noise(lit: str) -> None:
+    """Phase functions whose forward peak looks away from the emitter rarely scatter towards it."""
+    rough = {"type": "roughdielectric", "int_ior": 1.4, "ext_ior": 1.0, "alpha": 0.4}
+    surface = {"sigma_t": 1.0, "albedo": 0.95, "g": 0.8, "eta": 1.4, "b": rough, "reflection": False}
+    light = {"type": "point", "position": [20.0, 30.0, 40.0], "intensity": 1e4} if lit == "point" else _small_lamp()
+    directed, left_to_chance = (
+        _runs(mi.load_dict(_scene(surface, light, connection_share=share)), 8, spp, 1)
+        for share, spp in ((0.5, 64), (0.0, 1024))
+    )
+    _agree(directed, left_to_chance, known_to=0.03)
+    assert 64 * directed.var(axis=0).mean() < 0.25 * 1024 * left_to_chance.var(axis=0).mean()
+
+
 @pytest.mark.slow
 def test_a_point_light_is_seen_as_a_small_lamp_of_the_same_power() -> None:
     surface = {"sigma_s": 0.5, "sigma_a": 0.02, "eta": 1.0, "orders": "multiple"}

@@ -23,7 +23,10 @@ MEDIA = {
     "sky": {"albedo": "0.9,0.8,0.5", "sigma_t": "0.3,0.2,0.4", "g": 0.9, "eta": 1.3},
     "point": {"albedo": "0.95,0.9,0.8", "sigma_t": "1.0,0.5,0.8", "eta": 1.4},
     "lamp": {"albedo": "0.95,0.9,0.8", "sigma_t": "0.4,0.2,0.3", "g": 0.3, "eta": 1.0},
-}
+    "rough": {"albedo": "0.95,0.9,0.8", "sigma_t": "0.4,0.2,0.3", "g": 0.6, "eta": 1.4,
+              "b": {"type": "roughdielectric", "int_ior": 1.4, "ext_ior": 1.0, "alpha": 0.3}},
+}  # fmt: skip
+LIGHTS["rough"] = LIGHTS["lamp"]
 TWO = np.array([[[0.95, 0.85, 0.5], [0.8, 0.7, 0.45]]], np.float32)
 WIDEST_Z = 4.0
 RUNS = 6
@@ -74,6 +77,7 @@ def _mean(scene: mi.Scene, name: str, at: np.ndarray, seed: int, spp: int) -> np
     ("light", "key", "change", "spp", "known_to"),
     [("sky", "sigma_t", 0.2, 192, 0.02), ("point", "albedo", -0.2, 48, 0.1),
      ("point", "g", -0.6, 48, 0.25), ("lamp", "sigma_t", 0.2, 96, 0.1),
+     ("rough", "albedo", -0.2, 48, 0.1), ("rough", "g", -0.3, 96, 0.3),
      ("sky", "albedo.data", np.array([[[-0.3], [-0.1]]]), 96, 0.03)],
 )  # fmt: skip
 def test_derivatives_by_the_medium_add_up_to_the_difference_of_images(
