@@ -84,7 +84,7 @@ def modelled_scene(
 def modelled_contender(
     method: str, p: Params, folder: Path, sampler: str = "independent"
 ) -> mi.Scene | tuple[mi.Scene, ...]:
-    """The scene of a modelled object for a method, see `contenders.ready`.
+    """The scene of a modelled object for a method, see `methods.ready`.
 
     Args:
         method: of rendering.
