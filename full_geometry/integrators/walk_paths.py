@@ -570,11 +570,9 @@ class LightVisitor:
     ) -> mi.Spectrum:
         """Light of a sampled emitter by the surface at `si`; by a boundary only from its outer side.
         `share`: as of `next_event`."""
-        u, scenes = (
-            mi.Point2f(walk.rng.next_float32(), walk.rng.next_float32()),
-            (self.scene, self.media.instance_scene),
-        )
-        return walk.weight * next_event(*scenes, (si, bsdf), u, active, outwards, share=share)
+        u = mi.Point2f(walk.rng.next_float32(), walk.rng.next_float32())
+        rays = self.media.instance_scene
+        return walk.weight * next_event(self.scene, rays, (si, bsdf), u, active, outwards, share=share)
 
 
 def _same_state(*state: object) -> tuple:

@@ -427,8 +427,9 @@ class EmitterDirections:
         by_bsdf = choice < q
         w, distance, E = self.small.sample(which, si, u)
         bs, _ = boundary.sample(mi.BSDFContext(), si, choice / dr.maximum(q, 1e-6), u, by_bsdf)
-        w = dr.select(by_bsdf, opposed(si.to_world(bs.wo), si.n), w)
-        active = (~by_bsdf | (bs.pdf > 0)) & (dr.dot(w, si.n) > 0)
+        refracted = (bs.pdf > 0) & (bs.wo.z * mi.Frame3f.cos_theta(si.wi) < 0)
+        w = dr.select(by_bsdf, sided(si, bs.wo)[0], w)
+        active = (~by_bsdf | refracted) & (dr.dot(w, si.n) > 0)
 
         # ---- f(w) |cos| L_e / (q p_f + (1 - q) p_j), of a delta light f E if nothing hides it
         way = ray_from(si, w, self.media.instance_scene.rounding(si))
