@@ -443,10 +443,10 @@ def eval_hg(cos_theta: Real, g: Real) -> Real:
     Source: Henyey and Greenstein 1941.
     """
     lib = library(cos_theta, g)
-    size = abs(g) if isinstance(g, (int, float)) else lib.abs(g)
-    aligned = (
-        lib.where(g >= 0, cos_theta, -cos_theta) if not isinstance(g, (int, float)) else math.copysign(1, g) * cos_theta
-    )
+    if isinstance(g, (int, float)):
+        size, aligned = abs(g), math.copysign(1, g) * cos_theta
+    else:  # abs has no derivative at 0, where p has 3 cos_theta / (4 pi)
+        size, aligned = lib.where(g >= 0, g, -g), lib.where(g >= 0, cos_theta, -cos_theta)
     gap = lib.maximum((1 - size) * (1 - size) + 2 * size * (1 - aligned), 1e-30)
     return (1 - size) * (1 + size) / (4 * math.pi * gap * lib.sqrt(gap))
 

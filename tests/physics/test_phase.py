@@ -111,3 +111,21 @@ def test_means_of_the_phase_function_over_azimuth_are_those_of_its_values(g):
     mean, mean_cosine = _mean_hg(g, mu, sine, nu, nu_sine)
     np.testing.assert_allclose(mean, p.mean(axis=1), rtol=1e-13)
     np.testing.assert_allclose(mean_cosine, (p * np.cos(phi)).mean(axis=1), rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize("array", ["torch", "drjit"])
+def test_the_phase_function_has_its_derivative_by_g_where_scattering_is_even(array: str) -> None:
+    cosine = np.linspace(-1, 1, 5)
+    if array == "torch":
+        torch = pytest.importorskip("torch")
+        g = torch.zeros(5, dtype=torch.float64, requires_grad=True)
+        eval_hg(torch.from_numpy(cosine), g).sum().backward()
+        slope = g.grad.numpy()
+    else:
+        dr = pytest.importorskip("drjit")
+        types = pytest.importorskip("drjit.llvm.ad")
+        g = types.Float64(np.zeros(5))
+        dr.enable_grad(g)
+        dr.backward(eval_hg(types.Float64(cosine), g))
+        slope = np.array(dr.grad(g))
+    np.testing.assert_allclose(slope, 3 * cosine / (4 * np.pi), atol=1e-12)
