@@ -70,9 +70,37 @@ def without_nan(value: object) -> Json:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+def path_of(path: str | os.PathLike[str]) -> Path:
+    """A path of this machine, or that of an object store for a URL that fsspec knows, such as s3://BUCKET/maps.
+    ValueError if universal_pathlib is not installed, or no file system has the protocol. The package of the file
+    system, such as s3fs, is missed when the path is used."""
+    if is_remote(path):
+        return path
+    if "://" not in str(path):
+        return Path(path)
+    try:
+        from upath import UPath
+    except ImportError as error:
+        raise ValueError(f'{path} needs more packages: pip install "halfspace-sss[cluster]"; {error}') from error
+    return UPath(str(path))
+
+
+def is_remote(path: str | os.PathLike[str]) -> bool:
+    """Whether `path_of` found it to be in an object store, where files are whole or absent and nothing is renamed."""
+    return hasattr(path, "storage_options")
+
+
 def check_folder(folder: str | Path) -> Path:
     """The folder as a path; ValueError if it, or what it would lie in, is a file or cannot be written to."""
-    path = Path(folder)
+    path = path_of(folder)
+    if is_remote(path):
+        probe = path / f".{platform.node()}.{os.getpid()}"
+        try:
+            probe.write_bytes(b"1")
+            probe.unlink()
+        except Exception as error:  # packages of object stores raise errors of their own kinds
+            raise ValueError(f"folder must be one that can be written to, got {str(path)!r}: {error}") from error
+        return path
     part = next(part for part in (path, *path.absolute().parents) if part.exists())
     if not part.is_dir():
         raise ValueError(f"folder must be a folder or new, got {str(folder)!r}, where {str(part)!r} is a file")
@@ -86,7 +114,7 @@ def check_folder(folder: str | Path) -> Path:
 
 def read_bytes(path: str | Path, most: int = LARGEST) -> bytes:
     """The content of a file; OSError if it is no regular file (a device has no end) or larger than `most` bytes."""
-    path = Path(path)
+    path = path_of(path)
     path.stat()  # says why, if there is none
     if not path.is_file():
         raise OSError(errno.EINVAL, "it must be a regular file", str(path))
@@ -109,8 +137,13 @@ def write_atomically(path: Path, content: bytes | str) -> None:
 
 def write_together(files: Mapping[Path, bytes | str]) -> None:
     """Write files that belong together: those that are there at any moment are all whole and of the same writing.
-    All are written under temporary names first, so that a full disk leaves the files of before. OSError if a file
-    cannot be written; the message names it."""
+    All are written under temporary names first, so that a full disk leaves the files of before. In an object store they
+    are written in their order, each whole; readers there compare the checksum that the last one names. OSError if a
+    file cannot be written; the message names it."""
+    if any(map(is_remote, files)):
+        for path, content in files.items():
+            path.write_bytes(content.encode() if isinstance(content, str) else content)
+        return
     written: dict[Path, Path] = {}
     try:
         for path, content in files.items():
@@ -172,10 +205,10 @@ _held: set[tuple[Path, int]] = set()
 def one_writer(path: Path) -> Iterator[None]:
     """Hold the lock of a result, in `.NAME.lock` beside it, while it is written.
     The system lets go of the lock when a process ends, however it ends: a lock file that was left by one hinders
-    nobody. What this thread holds already it may hold again. ValueError if another run writes it; the message names its
-    process and computer."""
-    key = (path.absolute(), threading.get_ident())
-    if key in _held:
+    nobody. What this thread holds already it may hold again. Object stores have no locks. ValueError if another run
+    writes it; the message names its process and computer."""
+    key = (path.absolute() if not is_remote(path) else Path(), threading.get_ident())
+    if is_remote(path) or key in _held:
         yield
         return
     lock = path.with_name(f".{path.name}.lock")

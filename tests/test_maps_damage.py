@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ from halfspace_sss.maps.map_store import load_maps, make_maps
 
 MEDIA = {"m": Medium([1.0, 2.0], 0.1)}
 HOW = {"grid": MapGrid(2, 16, 4, 4), "target_error": None, "n_paths": 1024}
+COORDINATES = ("theta_i", "mu_i", "phi_i", "mu_o", "delta_phi", "r_edges", "psi_edges", "mfp")
 
 
 @pytest.mark.parametrize("at", [4, 8, 12])
@@ -23,8 +26,35 @@ def test_a_chunk_with_other_bytes_is_refused_with_the_name_of_the_store(at: int,
     data = bytearray(chunk.read_bytes())
     data[at : at + 4] = b"\x08\x01\xf6\x31"
     chunk.write_bytes(data)
-    with pytest.raises(ValueError, match="m.zarr is damaged"):
+    with pytest.raises(ValueError, match=r"m.zarr is damaged or not a map store"):
         load_maps(path)
+
+
+def _change(path: Path, name: str) -> None:
+    """Another last bit in the first number of a coordinate, in a chunk that is whole."""
+    import zarr
+
+    array = zarr.open_group(path, mode="r+")[name]
+    values = array[...]
+    values.flat[0] = np.nextafter(values.flat[0], np.inf)
+    array[...] = values
+
+
+@pytest.mark.parametrize("coordinate", COORDINATES)
+def test_a_coordinate_with_another_last_bit_is_refused_by_name(coordinate: str, tmp_path: Path) -> None:
+    path = make_maps(MEDIA, tmp_path, **HOW)["m"]
+    assert set(load_maps(path).coords) == set(COORDINATES)
+    _change(path, coordinate)
+    said = rf"m.zarr is damaged or .*: coordinate {coordinate} does not match its checksum"
+    for read in (lambda: load_maps(path), lambda: make_maps(MEDIA, tmp_path, **HOW)):
+        with pytest.raises(ValueError, match=said):
+            read()
+
+
+def test_checksums_of_coordinates_are_those_of_their_numbers(tmp_path: Path) -> None:
+    maps = load_maps(make_maps(MEDIA, tmp_path, **HOW)["m"])
+    written = json.loads(maps.attrs["checksums_of_coordinates"])
+    assert written == {name: zlib.crc32(maps[name].values.tobytes()) for name in COORDINATES}
 
 
 @pytest.mark.parametrize("kept", [0, 7, 40])

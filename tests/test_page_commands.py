@@ -55,6 +55,7 @@ UNDERSTOOD = {  # by their beginnings, why
     "figures all --quality draft": "15 minutes",
     "figures all fig09 fig10 --scheduler": "a scheduler",
     "maps marble ketchup --scheduler": "a scheduler",
+    "maps marble --scheduler": "a scheduler and a bucket",
 }
 HOME = ("XDG_", "HALFSPACE_SSS", "MPL")
 SCENE = """<scene version="3.0.0">

@@ -11,6 +11,7 @@ import typer
 
 from full_geometry.cli.variants import Drawers, SceneOptions, use_mitsuba
 from halfspace_sss.cli import shared
+from halfspace_sss.noise_free import NoiseFree
 from halfspace_sss.provenance import check_folder, provenance, write_together
 
 if TYPE_CHECKING:
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 
     from full_geometry.trade.results import ObjectTrade, TechniqueTrade
 
+SHIPPED = "trade.csv"  # in the package: three materials, two shapes, two lights
 HEADINGS = ("technique", "bias, %", "variance", "s a million", "cost")
 
 
@@ -47,11 +49,21 @@ class MeasuringOptions:
 
 def trade(
     context: typer.Context,
-    scene: Annotated[Path, typer.Argument(help="Mitsuba XML or glTF file.")],
     wanted: TradeOptions,
     measuring: MeasuringOptions,
     on: SceneOptions,
+    what: Annotated[
+        str | None,
+        typer.Argument(
+            help="A Mitsuba XML or glTF file, or a material for curves.",
+            metavar="SCENE_OR_MATERIAL",
+            show_default="the shipped table",
+        ),
+    ] = None,
     model: shared.Models = None,
+    r: Annotated[
+        str | None, typer.Option(help="Smallest and largest distance for curves of a material, mm, as 0.1,20.")
+    ] = None,
     out: shared.OutFolder = Path("trade"),
 ) -> None:
     """Measure speed against accuracy: a table, a recommendation, CSV, JSON, and the figure and page of a scene."""
@@ -59,12 +71,60 @@ def trade(
 
     check_interval("tolerance", wanted.tolerance, 1e-4, 1.0)  # 5 is meant as 5 %
     check_count("images", wanted.images, 1)
-    parameters = on.parameters()
-    check_folder(out)
-    use_mitsuba(on.variant)
-    how = {"seconds": measuring.assess, "models": model or None, "sensor": measuring.sensor, "seed": measuring.seed}
-    how |= {"parameters": parameters, "train_seconds": measuring.train_seconds}
-    _scene(scene, wanted, measuring.every, how, out, context.find_object(Drawers))
+    if what is None:
+        _check_left_out("without a scene or a material", seconds=wanted.seconds, model=model, r=r, define=on.define)
+        _shipped()
+    elif Path(what).suffix == ".xml" or Path(what).is_file():
+        _check_left_out("with a scene", r=r)
+        parameters = on.parameters()
+        check_folder(out)
+        use_mitsuba(on.variant)
+        how = {"seconds": measuring.assess, "models": model or None, "sensor": measuring.sensor, "seed": measuring.seed}
+        how |= {"parameters": parameters, "train_seconds": measuring.train_seconds}
+        _scene(Path(what), wanted, measuring.every, how, out, context.find_object(Drawers))
+    else:
+        _check_left_out("with a material", seconds=wanted.seconds, define=on.define)
+        check_folder(out)
+        limits = None if r is None else tuple(shared.numbers("r", r))
+        how = {"r": limits, "tolerance": wanted.tolerance, "models": model or None, "seed": measuring.seed}
+        _material(what, how, out)
+
+
+def _check_left_out(beside: str, **options: object) -> None:
+    """ValueError if one of the options was given where `beside` says that it has no place."""
+    for name, value in options.items():
+        if value not in (None, []):
+            raise ValueError(f"{name} must be left out {beside}, got {value!r}")
+
+
+def _shipped() -> None:
+    """The table of the package."""
+    from importlib import resources
+
+    import pandas
+
+    with resources.as_file(resources.files("full_geometry.trade").joinpath("data", SHIPPED)) as path:
+        rows = list(pandas.read_csv(path).itertuples())
+    cells = []
+    for row in rows:
+        bias = "exact" if row.way == "path_traced" else NoiseFree(row.bias2, row.bias2_standard_error).told()
+        cost = (f"{row.variance:.3g}", f"{row.seconds_per_million:.3g}", f"{row.cost:.3g}", f"{row.flip:.3f}")
+        cells.append((row.material, row.shape, row.light, row.way, bias, *cost))
+    shared.say(shared.table(["material", "shape", "light", *HEADINGS, "FLIP"], cells, left=4))
+    shared.say("measured by `python -m benchmarks figures all trade`; docs/trade.md says how")
+
+
+def _material(name: str, how: dict[str, Any], out: Path) -> None:
+    from full_geometry.trade.advice import recommend_flat
+    from halfspace_sss import materials
+
+    result = recommend_flat(materials.load(name).medium, **how)
+    about = {"provenance": provenance(material=name, **how), **result.record()}
+    texts = {"csv": shared.csv_of(result.table()), "json": json.dumps(about, indent=1) + "\n"}
+    files = {out / f"{name}_trade.{ending}": text for ending, text in texts.items()}
+    write_together(files)
+    shared.say(str(result))
+    shared.say_files(files)
 
 
 def _scene(

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 from halfspace_sss.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from full_geometry.trade.advice import recommend
+    from full_geometry.trade.advice import recommend, recommend_flat
     from full_geometry.trade.assessing import assess
     from full_geometry.trade.results import Assessment, ObjectTrade, TechniqueTrade
 
-__all__ = ["Assessment", "ObjectTrade", "TechniqueTrade", "assess", "recommend"]
+__all__ = ["Assessment", "ObjectTrade", "TechniqueTrade", "assess", "recommend", "recommend_flat"]
 
 RESULTS = ["Assessment", "ObjectTrade", "TechniqueTrade"]
-MODULES = {"results": RESULTS, "assessing": ["assess"], "advice": ["recommend"]}
+MODULES = {"results": RESULTS, "assessing": ["assess"], "advice": ["recommend", "recommend_flat"]}
 __getattr__, __dir__ = lazy_names(__name__, MODULES)

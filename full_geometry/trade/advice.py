@@ -8,23 +8,41 @@ object each takes, until bias and noise together are at the tolerance e,
 and a way with b >= e never gets there. Noise of denoised walks falls by a power of the samples (`denoised_walks`).
 With standard errors s of b² and v of V, and x = 1 / samples, b² + V x + sqrt(s² + v² x² / 4) is taken: biases of models
 are spread over decades, so that few lie where that errs; noise is as likely below what was measured as above it.
+
+Without a scene, `recommend_flat` finds the cheapest model of a medium for curves over a range of distances. Error:
+energy-weighted relative L1 over pairs of directions against path tracing, see `comparison.model_errors`; cost: seconds
+of a million values of S. Path tracing finds those of all cells and directions at once, and takes until their own noise
+is at the tolerance.
 """
 
 from __future__ import annotations
 
 import math
+import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
 
 from full_geometry.settings import GATHERED_LIGHTS, PATH_TRACED
 from full_geometry.trade.assessing import assess
 from full_geometry.trade.results import UNNAMED, Assessment, ObjectTrade, TechniqueTrade
 from full_geometry.trade.techniques import WALKED, Job, Technique
-from halfspace_sss.noise_free import short
+from halfspace_sss.checks import check_choice, check_count, check_interval
+from halfspace_sss.comparison.curve_set import TRACED
+from halfspace_sss.comparison.model_errors import TracedMaps, model_error, references
+from halfspace_sss.comparison.reflectance_curves import evaluations_per_s
+from halfspace_sss.noise_free import NoiseFree, short
+from halfspace_sss.physics.medium import Medium, medium_of
+from halfspace_sss.provenance import without_nan
+from halfspace_sss.registry import bssrdf
+from halfspace_sss.registry import models as registered
 
 if TYPE_CHECKING:
     import mitsuba as mi
+    import pandas
 
 INTEGRATOR = "bssrdf"
 DARK = "no light comes from it, every technique shows it black"
@@ -80,17 +98,21 @@ class Advice:
         return f"<{self.integrator} for a tolerance of {self.tolerance:.3g}; {ways}>"
 
     def _repr_html_(self) -> str:
-        import pandas
-
-        rows = [{"object": each.object, **asdict(option)} for each in self.objects for option in each.options]
-        with pandas.option_context("display.max_colwidth", None):  # whole sentences
-            return pandas.DataFrame(rows).to_html(index=False, float_format="{:.3g}".format)
+        return _html([{"object": each.object, **asdict(option)} for each in self.objects for option in each.options])
 
     def __str__(self) -> str:
         text = [str(each) for each in self.objects]
         if len(self.objects) > 1:
             text.append(f"all objects together: {self.integrator}, {_time(self.seconds)}")
         return "\n".join(text)
+
+
+def _html(rows: list[dict[str, Any]]) -> str:
+    """A table with whole sentences."""
+    import pandas
+
+    with pandas.option_context("display.max_colwidth", None):
+        return pandas.DataFrame(rows).to_html(index=False, float_format="{:.3g}".format)
 
 
 def recommend(
@@ -103,6 +125,8 @@ def recommend(
     **assessing: Any,
 ) -> Advice:
     """The cheapest way of rendering a scene that keeps a tolerance, with a sentence on every other one.
+
+    For curves of a medium see `flat.recommend_flat`.
 
     Args:
         scene: as in `assess`, or an `Assessment` that has been made.
@@ -229,3 +253,160 @@ def _time(seconds: float) -> str:
         if seconds >= 1.6 * length:
             return f"{seconds / length:.3g} {unit}"
     return f"{short(seconds)} s"
+
+
+EVENTS = 4e6  # of the walks of each channel
+REACH = (0.02, 60.0)  # mean free paths that are compared where no range is given
+
+
+@dataclass(frozen=True)
+class FlatOption:
+    """A model for a medium: largest error of its channels, what that is below in 95 % of cases, seconds for a million
+    values, one sentence."""
+
+    model: str
+    error: float
+    bound: float
+    seconds_per_million: float
+    why: str
+
+
+@dataclass(frozen=True, repr=False)
+class FlatAdvice:
+    """The model for a medium, and all that were compared, the chosen one first."""
+
+    model: str
+    tolerance: float
+    r: tuple[float, float]
+    options: tuple[FlatOption, ...]
+
+    def __repr__(self) -> str:
+        return f"<{self.model} for a tolerance of {self.tolerance:.3g}, of {len(self.options)} ways>"
+
+    def _repr_html_(self) -> str:
+        return _html([asdict(option) for option in self.options])
+
+    def __str__(self) -> str:
+        return "\n".join(option.why for option in self.options)
+
+    def record(self) -> dict[str, Any]:
+        """Ready for JSON; what is not finite, as of a model that refuses, is None there."""
+        return without_nan(asdict(self))
+
+    def table(self) -> pandas.DataFrame:
+        """One row for each way."""
+        import pandas
+
+        return pandas.DataFrame([asdict(option) for option in self.options])
+
+
+def recommend_flat(
+    medium: Medium,
+    r: tuple[float, float] | None = None,
+    *,
+    tolerance: float = 0.05,
+    models: Sequence[str] | None = None,
+    events: float = EVENTS,
+    seed: int = 0,
+) -> FlatAdvice:
+    """The cheapest model of the half-space that keeps a tolerance over a range of distances.
+
+    Args:
+        medium: or a material; of several channels the worst counts.
+        r: smallest and largest distance, mm; by default 0.02 to 60 mean free paths.
+        tolerance: relative error of S mu_i mu_o, summed over cells of the range and pairs of directions.
+        models: names, by default all.
+        events: scattering events of the walks, for each channel.
+        seed: of the walks.
+
+    Raises:
+        ValueError: an argument is out of range, or no light comes back within the distances.
+    """
+    medium = medium_of(medium)
+    check_interval("tolerance", tolerance, 1e-4, 10.0)
+    check_interval("events", events, 1e4, 1e12)
+    check_count("seed", seed, 0)
+    for name in models or ():
+        check_choice("model", name, registered())
+    parts = [m for m in medium.channels() if float(m.sigma_s) > 0]
+    if not parts:
+        raise ValueError("medium must scatter, got albedo 0: S of order 2 and more is 0, no model is needed")
+    _check_range(r)
+    started = time.perf_counter()
+    result = references([m.in_mfp() for m in parts], events * len(parts), seed, 4)
+    tracing = time.perf_counter() - started
+    within = [(r[0] * float(m.sigma_t), r[1] * float(m.sigma_t)) if r else REACH for m in parts]
+    values = 0
+    for m, one, (low, high) in zip(parts, result, within):
+        energies, radii = one.energies(), one.block_radii()
+        lit = ((radii >= low) & (radii <= high))[:, None, None, :, None]
+        if not (energies * lit).sum() > 0:
+            raise ValueError(
+                f"r must hold distances at which light comes back, got {low:.3g} to {high:.3g} mean free paths for "
+                f"albedo {float(m.albedo):.4g}; walks reach {radii.min():.2g} to {radii.max():.3g}"
+            )
+        values += int(np.broadcast_to(lit, energies[:, :1].shape).sum())  # of S, of cells and pairs of directions
+    rows = [_row(name, parts, result, within) for name in models or registered()]
+    noise = max((row.noise for row in rows if row.noise < math.inf), default=math.inf)
+    rows.append(_Row(TRACED, NoiseFree(0.0, 0.0), tolerance, tracing * (noise / tolerance) ** 2 / values))
+    return _advice(rows, tolerance, r or REACH, "mm" if r else "mean free paths")
+
+
+def _check_range(r: tuple[float, float] | None) -> None:
+    if r is None:
+        return
+    if len(r) != 2:
+        raise ValueError(f"r must be a smallest and a largest distance, mm, got {r!r}")
+    check_interval("r[0]", r[0], 0.0, 1e9)
+    check_interval("r[1]", r[1], 0.0, 1e9)
+    if not r[0] < r[1]:
+        raise ValueError(f"r must ascend, got {r!r}")
+
+
+class _Row(NamedTuple):
+    """Largest error of the channels of a model, noise of the walks, seconds of a value, why it refuses."""
+
+    name: str
+    error: NoiseFree
+    noise: float
+    seconds: float
+    refusal: str = ""
+
+
+def _row(name: str, media: list[Medium], maps: list[TracedMaps], within: list[tuple[float, float]]) -> _Row:
+    errors, noises, seconds = [], [], 0.0
+    for m, one, bounds in zip(media, maps, within):
+        try:
+            model = bssrdf(name, m.in_mfp())
+        except ValueError as error:
+            return _Row(name, NoiseFree(math.inf, 0.0), math.inf, math.inf, str(error))
+        e = model_error(model, one, bounds)
+        errors.append(e.known)
+        noises.append(e.noise)
+        seconds += 1 / evaluations_per_s(model, 0.01, 10.0, least_seconds=0.01)
+    return _Row(name, max(errors, key=lambda e: e.bound), max(noises), seconds / len(media))
+
+
+def _advice(rows: list[_Row], tolerance: float, r: tuple[float, float], unit: str) -> FlatAdvice:
+    keeping = [row for row in rows if row.error.bound <= tolerance and row.name != TRACED]
+    best = min(keeping, key=lambda row: row.seconds) if keeping else rows[-1]
+    options = []
+    for row in sorted(rows, key=lambda row: (row is not best, row.error.value)):
+        name, error, _, seconds, refusal = row
+        off = f"{error.told()} % off"
+        cost = f"{1e6 * seconds:.3g} s for a million values"
+        if name == TRACED:
+            why = f"{name} takes {cost}, of all directions at once, until their noise is {100 * tolerance:.3g} %"
+        elif refusal:
+            why = f"{name}: {refusal}"
+        elif row is best:
+            why = f"{name} is the cheapest model that keeps {100 * tolerance:.3g} %, "
+            why += f"r {r[0]:.3g} to {r[1]:.3g} {unit}: {off}, {cost}"
+        elif row in keeping:
+            why = f"{name} is {seconds / best.seconds:.2g} times dearer: {off}, {cost}"
+        elif error.square - 2 * error.square_error > tolerance**2:
+            why = f"{name} is {off}, the tolerance is {100 * tolerance:.3g} %"
+        else:
+            why = f"{name} is {off}: whether it keeps {100 * tolerance:.3g} % is open, more events would tell"
+        options.append(FlatOption(name, error.value, error.bound, 1e6 * seconds, why))
+    return FlatAdvice(best.name, tolerance, r, tuple(options))

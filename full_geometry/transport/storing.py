@@ -31,6 +31,7 @@ from full_geometry.transport.one_object import BASE_MODEL, DirectionalAlbedo, Fu
 from full_geometry.transport.patches import AREA_SHARE, LearntProposals, Patches, PatchSampler, PatchTable
 from halfspace_sss.neural.store import checksum_of, load_weights, save_weights, weights_folder
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.provenance import path_of
 
 ANCHORS = 256
 CLOSE = 1e-4  # positions over the size of the object, coefficients relative
@@ -311,14 +312,14 @@ def save(
     bound = {"anchors": identity.anchors.astype(np.float32)}
     if identity.grids:
         bound["probes"] = identity.probes
-    return save_weights(Path(folder) / weights_name(identity), KIND, {**arrays, **bound}, whole)
+    return save_weights(path_of(folder) / weights_name(identity), KIND, {**arrays, **bound}, whole)
 
 
 def find_weights(obj: TranslucentObject, folder: str | os.PathLike[str] | None = None) -> Path:
     """The file of weights of an object.
     ValueError if there is none, which says what tells the object from the nearest one that was trained."""
     here = identify(obj)
-    place = Path(folder or weights_folder())
+    place = path_of(folder or weights_folder())
     reasons = []
     for path in sorted(place.glob(f"{KIND}-{here.digest()}-*.safetensors")):
         try:
@@ -353,7 +354,7 @@ def nearest(
     here, found = identify(obj), []
     if here.grids or here.contents or here.textures:
         return None
-    for path in Path(folder or weights_folder()).glob(f"{KIND}-*.safetensors"):
+    for path in path_of(folder or weights_folder()).glob(f"{KIND}-*.safetensors"):
         try:
             identity, arrays, record = _trained(path)
             R, _ = identity.moved(here)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from halfspace_sss.cli import shared
-from halfspace_sss.provenance import check_folder
+from halfspace_sss.provenance import check_folder, path_of
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -52,9 +52,14 @@ def maps(
     name: Annotated[
         str | None, typer.Option(help="Name of the store of a medium given by coefficients.", show_default="medium")
     ] = None,
-    out: Annotated[Path, typer.Option(help="Folder of the stores; a run with the same options is continued.")] = Path(
-        "maps"
-    ),
+    out: Annotated[
+        Path,
+        typer.Option(
+            help="Folder of the stores, or a URL as s3://BUCKET/maps; a run with the same options is continued.",
+            parser=path_of,
+            metavar="FOLDER",
+        ),
+    ] = Path("maps"),
 ) -> None:
     """Trace training maps into Zarr stores; an interrupted run goes on when it is started again."""
     from halfspace_sss.maps.map_store import make_maps

@@ -196,18 +196,23 @@ def _weight(mu: np.ndarray, eta: float) -> np.ndarray:
     return mu * F_t(mu, eta)
 
 
-def model_error(model: BSSRDF, reference: TracedMaps) -> ModelError:
+def model_error(model: BSSRDF, reference: TracedMaps, within: tuple[float, float] | None = None) -> ModelError:
     """Error of a model against traced maps of its medium, at the orders of the model; see the module.
 
     Args:
         model: made for `reference.medium`. Where it contains single scattering the exact one is added to the maps.
         reference: traced with seeds that the model was not trained with.
+        within: smallest and largest distance that counts, mean free paths; by default all.
     """
     # energies of both halves of the reference and of the model in blocks of cells
     halves, E = reference.energies(), reference.model_energies(model)
+    if within is not None:
+        radii = reference.block_radii()
+        counts = ((radii >= within[0]) & (radii <= within[1]))[:, None, :, None]
+        halves, E = halves * counts[:, None], E * counts
     traced = halves.mean(axis=1)
     if model.orders == "total":
-        traced = traced + reference.single_energies()
+        traced = traced + reference.single_energies() * (1 if within is None else counts)
     total = float(traced.sum() or E.sum() or 1.0)  # a medium that does not scatter has none
     # raw = sum |E - E_t| / sum E_t, and the same of half the difference of the halves, which is noise alone
     deviation, noise = np.abs(E - traced), 0.5 * np.abs(halves[:, 0] - halves[:, 1])

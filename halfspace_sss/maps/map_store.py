@@ -1,6 +1,6 @@
 """Training maps of half-spaces: made in units that can be killed, resumed and spread; stored as labelled Zarr.
 
-Units and attributes have checksums, and so have the chunks of Zstandard of all arrays.
+Units, coordinates and attributes have checksums, and so have the chunks of Zstandard that hold them.
 """
 
 from __future__ import annotations
@@ -26,20 +26,26 @@ from halfspace_sss.maps.grid import MapGrid, cell_edges, map_directions
 from halfspace_sss.maps.map_tracing import MapUnit, trace_unit
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import ProgressText
-from halfspace_sss.provenance import JsonDict, naming, one_writer, provenance
+from halfspace_sss.provenance import JsonDict, is_remote, naming, one_writer, path_of, provenance
 
 if TYPE_CHECKING:
     import xarray as xr
 
 
 ASKED = "halfspace_sss_maps"  # the attribute with medium, grid and numbers of walks
-ATTRIBUTE = "checksum_of_halfspace_sss_maps"
+METADATA = ".zmetadata"  # of all arrays of a store
+COORDINATES, ATTRIBUTE = "checksums_of_coordinates", "checksum_of_halfspace_sss_maps"
 
 
 def unit_checksum(S: np.ndarray, variance: np.ndarray) -> int:
     """Checksum of the data of a unit; never 0, which marks a unit not done."""
     data = np.ascontiguousarray(S, np.float32).tobytes(), np.ascontiguousarray(variance, np.float32).tobytes()
     return (1 << 32) | zlib.crc32(data[1], zlib.crc32(data[0]))
+
+
+def _coordinates(dataset: xr.Dataset) -> dict[str, int]:
+    """Checksums of the coordinates, in float64."""
+    return {str(name): zlib.crc32(np.asarray(c.values, "<f8").tobytes()) for name, c in dataset.coords.items()}
 
 
 FORMAT = 1
@@ -69,7 +75,7 @@ def make_maps(
 
     Args:
         media: name -> medium; channels of a medium become a dimension of its store.
-        folder: where the stores are, made if absent.
+        folder: where the stores are, made if absent; or a URL of an object store (see `provenance.path_of`).
         grid: numbers of directions and cells.
         target_error: stop a unit at this mean cell error (see `trace_unit`); None to trace `n_paths` exactly.
         n_paths: walks per unit and group of 16 observations; with a target error, the most that are traced.
@@ -88,17 +94,17 @@ def make_maps(
     n_paths = n_paths if n_paths is None else as_count("n_paths", n_paths, 1024)
     _check(media, target_error, n_paths, seed)
     array_types(backend)
-    paths = {name: Path(folder) / f"{name}.zarr" for name in media}
+    paths = {name: path_of(folder) / f"{name}.zarr" for name in media}
     asked = {name: _parameters(m, grid, target_error, n_paths, seed, backend) for name, m in media.items()}
     units = _units(media, grid, target_error, n_paths or MOST_PATHS, seed, backend)
     with contextlib.ExitStack() as locks:
         for path in paths.values():
             locks.enter_context(one_writer(path))
         # make the stores that are not there, once those that are there are known to be of the same parameters
-        for name in filter(lambda name: paths[name].exists(), media):
+        for name in filter(lambda name: _exists(paths[name]), media):
             _open_same(paths[name], asked[name])
         for name, medium in media.items():
-            if not paths[name].exists():
+            if not _exists(paths[name]):
                 _create(paths[name], medium, grid, seed, asked[name])
         # trace the units that are not whole
         stores = {name: _open_same(path, asked[name]) for name, path in paths.items()}
@@ -183,13 +189,14 @@ def _template(medium: Medium, grid: MapGrid, seed: int) -> xr.Dataset:
 
 
 def _create(path: Path, medium: Medium, grid: MapGrid, seed: int, asked: JsonDict) -> None:
-    """A store of the right shape, made under another name and renamed.
+    """A store of the right shape, made under another name and renamed; in an object store, with its metadata last.
     Encoded in memory: zarr's threads, which an interrupt does not end, would write on into a folder just removed."""
     import zarr
     from numcodecs import Zstd
 
     dataset, memory = _template(medium, grid, seed), {}
     dataset.attrs |= {ASKED: json.dumps(asked, sort_keys=True), "provenance": json.dumps(provenance())}
+    dataset.attrs[COORDINATES] = json.dumps(_coordinates(dataset), sort_keys=True)
     dataset.attrs[ATTRIBUTE] = zlib.crc32(dataset.attrs[ASKED].encode())
     key = "compressor" if zarr.__version__ < "3" else "compressors"  # version 2 is the last one for Python 3.10
     kinds = {name: {key: Zstd(checksum=True)} for name in dataset.variables}
@@ -198,6 +205,10 @@ def _create(path: Path, medium: Medium, grid: MapGrid, seed: int, asked: JsonDic
     dataset.to_zarr(memory, mode="w", zarr_format=2, encoding=kinds)
     # bytes in version 2 of zarr
     content = {key: data if isinstance(data, bytes) else data.to_bytes() for key, data in memory.items()}
+    if is_remote(path):
+        for key in sorted(content, key=METADATA.__eq__):
+            (path / key).write_bytes(content[key])
+        return
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     shutil.rmtree(temporary, ignore_errors=True)
     try:
@@ -210,17 +221,30 @@ def _create(path: Path, medium: Medium, grid: MapGrid, seed: int, asked: JsonDic
         shutil.rmtree(temporary, ignore_errors=True)
 
 
+def _exists(path: Path) -> bool:
+    return (path / METADATA).exists() if is_remote(path) else path.exists()
+
+
+def _at(path: Path) -> JsonDict:
+    """A store in the words of xarray."""
+    return {"store": str(path), "storage_options": dict(path.storage_options)} if is_remote(path) else {"store": path}
+
+
 def _open(path: Path) -> xr.Dataset:
     import xarray as xr
 
     try:
-        dataset = xr.open_zarr(path, chunks=None)
+        dataset = xr.open_zarr(**_at(path), chunks=None)
         asked = json.loads(dataset.attrs[ASKED])
         missing = {*DATA, "checksum", "n_paths", "n_events"} - set(dataset.data_vars)
         if missing:
             raise KeyError(f"arrays {', '.join(sorted(missing))}")
         if dataset.attrs[ATTRIBUTE] != zlib.crc32(dataset.attrs[ASKED].encode()):
             raise ValueError(f"attribute {ASKED} does not match its checksum")
+        written, result = json.loads(dataset.attrs[COORDINATES]), _coordinates(dataset)
+        for name in sorted(written.keys() | result.keys()):
+            if written.get(name) != result.get(name):
+                raise ValueError(f"coordinate {name} does not match its checksum")
     except Exception as error:  # zarr, JSON and xarray each raise their own kinds
         raise ValueError(f"map store {path} is damaged or not a map store: {error}") from error
     if asked.get("format") != FORMAT:
@@ -261,10 +285,10 @@ def _trace_and_write(path: Path, channel: int, unit: MapUnit) -> None:
         data[name] = (dims[:2], np.full((1, 1), getattr(result, name), kind))
     region = {"channel": slice(channel, channel + 1), "theta": slice(theta, theta + 1)}
     with naming(path):
-        xr.Dataset(data).to_zarr(path, region=region, mode="r+")
+        xr.Dataset(data).to_zarr(**_at(path), region=region, mode="r+")
     checksum = np.full((1, 1), unit_checksum(result.S, result.variance), np.uint64)
     with naming(path):
-        xr.Dataset({"checksum": (dims[:2], checksum)}).to_zarr(path, region=region, mode="r+")
+        xr.Dataset({"checksum": (dims[:2], checksum)}).to_zarr(**_at(path), region=region, mode="r+")
 
 
 def load_maps(path: str | os.PathLike[str]) -> xr.Dataset:
@@ -277,8 +301,8 @@ def load_maps(path: str | os.PathLike[str]) -> xr.Dataset:
     Raises:
         ValueError: the store is absent, damaged or unfinished; the message names store, channel and direction.
     """
-    path = Path(path)
-    if not path.exists():
+    path = path_of(path)
+    if not _exists(path):
         raise ValueError(f"map store must exist, got {path}")
     dataset = _open(path)
     try:

@@ -20,7 +20,7 @@ import numpy as np
 
 from halfspace_sss.checks import check_interval
 from halfspace_sss.physics.medium import Medium, check_numbers
-from halfspace_sss.provenance import JsonDict, check_folder, read_bytes, read_text, write_together
+from halfspace_sss.provenance import JsonDict, check_folder, path_of, read_bytes, read_text, write_together
 
 FORMAT = 1
 LARGEST = 1e4  # no weight of a network that works is as large
@@ -64,7 +64,7 @@ def save_weights(path: str | os.PathLike[str], kind: str, arrays: Mapping[str, n
     .safetensors, or a number is such that loading would refuse it, which is what a training that diverged gives."""
     from safetensors.numpy import save
 
-    path = Path(path)
+    path = path_of(path)
     if path.suffix != ".safetensors":
         raise ValueError(f"path must end in .safetensors, got {str(path)!r}")
     _check_numbers(path, arrays)
@@ -80,7 +80,7 @@ def load_weights(path: str | os.PathLike[str], kind: str) -> tuple[dict[str, np.
     """Arrays and record of a file of weights.
     ValueError if it is no such file, is truncated or altered, of another kind, version or shape, or holds numbers that
     are not finite; the message names the file."""
-    path = Path(path)
+    path = path_of(path)
     record = _read_record(path, kind)
     try:
         data = read_bytes(path)
@@ -93,7 +93,7 @@ def load_weights(path: str | os.PathLike[str], kind: str) -> tuple[dict[str, np.
 
 def checksum_of(path: str | os.PathLike[str], kind: str) -> str:
     """SHA-256 of the arrays of a file of weights, as its record names it; errors as in `load_weights`."""
-    return _read_record(Path(path), kind)["sha256"]
+    return _read_record(path_of(path), kind)["sha256"]
 
 
 def _read_record(path: Path, kind: str) -> JsonDict:
@@ -143,9 +143,9 @@ RATIOS = ("albedo", "g", "eta")
 
 
 def weights_folder() -> Path:
-    """Folder for trained weights: HALFSPACE_SSS_WEIGHTS, or the user's data folder."""
+    """Folder for trained weights: HALFSPACE_SSS_WEIGHTS, also a URL, or the user's data folder."""
     if os.environ.get(ENVIRONMENT_VARIABLE):
-        return Path(os.environ[ENVIRONMENT_VARIABLE])
+        return path_of(os.environ[ENVIRONMENT_VARIABLE])
     variable, default = ("LOCALAPPDATA", "AppData/Local") if os.name == "nt" else ("XDG_DATA_HOME", ".local/share")
     return Path(os.environ.get(variable) or Path.home() / default) / "halfspace-sss" / "weights"
 

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 import halfspace_sss as sss
 from figures import app as cli
+from full_geometry.trade import recommend_flat
 from halfspace_sss.provenance import read_text
 
 MEDIUM = sss.Medium.from_albedo(0.75, 0.241)
@@ -40,9 +41,9 @@ def test_the_package_runs_as_a_module() -> None:
 
 
 def test_a_terminal_without_unicode_shows_every_table() -> None:
-    found = _run("models", PYTHONIOENCODING="ascii", LC_ALL="C")
+    found = _run("trade", PYTHONIOENCODING="ascii", LC_ALL="C")
     assert found.returncode == 0, found.stderr
-    assert b"photon_beam_diffusion" in found.stdout
+    assert b"path_traced" in found.stdout
 
 
 def test_help_of_the_surface_works_before_it_is_registered() -> None:
@@ -90,13 +91,14 @@ def test_errors_of_reflectance_are_those_of_the_series(curve_set) -> None:
 
 
 def test_objects_show_medium_and_unit_in_a_line(curve_set) -> None:
+    advice = recommend_flat(MEDIUM, tolerance=0.5, events=1e5, models=["better_dipole"])
     trace = sss.trace(MEDIUM, 0.5, n_paths=1000)
-    for found in (sss.bssrdf("neural", MEDIUM), trace, curve_set):
+    for found in (sss.bssrdf("neural", MEDIUM), trace, curve_set, advice):
         assert "\n" not in repr(found) and len(repr(found)) < 200
     for found in (sss.bssrdf("neural", MEDIUM), trace, curve_set):
         assert "sigma_t 0.241/mm, albedo 0.75, g 0, eta 1.3" in repr(found)
     marble = sss.materials.load("marble")
-    for found in (MEDIUM, marble.medium, marble, curve_set):
+    for found in (MEDIUM, marble.medium, marble, curve_set, advice):
         assert "<table" in found._repr_html_()
     assert "marble, Jensen2001" in marble._repr_html_()
 

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from figures import app as cli
 from full_geometry.integrators import translucent_walk
-from full_geometry.trade import assess, automatic, measuring, recommend
+from full_geometry.trade import advice, assess, automatic, measuring, recommend, recommend_flat
 from full_geometry.trade.assessing import assess_stage
 from full_geometry.trade.denoised_walks import Tiles, _apart, _side_by_side
 from full_geometry.trade.denoising import guides
@@ -430,6 +430,49 @@ def test_objects_without_weights_are_learnt_before_and_refusals_are_heard(monkey
     with pytest.warns(UserWarning, match="'ball2' is not learnt: ball2 must be closed"):
         assessing.learn(stage(scene(n=3)), 7.0)
     assert Learnt.asked == [("ball1", 7.0), ("ball2", 7.0)]
+
+
+def test_a_medium_without_a_scene_gets_a_model_of_the_half_space() -> None:
+    medium = Medium.from_albedo(0.75, 0.241, 0.0, 1.3)
+    found = recommend_flat(medium, r=(1.0, 40.0), tolerance=0.2, events=2e5, models=["better_dipole", "neural"])
+    assert found.model == "neural"
+    assert [option.model for option in found.options] == ["neural", "path_traced", "better_dipole"]
+    assert found.options[-1].why.endswith("the tolerance is 20 %")
+    neural, traced, _ = found.options
+    for option in (neural, traced):
+        assert f"{option.seconds_per_million:.3g} s for a million values" in option.why
+    record = json.loads(json.dumps(found.record()))
+    assert [option["model"] for option in record["options"]] == list(found.table()["model"])
+
+
+def test_the_command_writes_what_it_says_of_a_material(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        advice.recommend_flat, "__kwdefaults__", {**advice.recommend_flat.__kwdefaults__, "events": 2e5}
+    )
+    arguments = ["--model", "better_dipole", "--tolerance", "0.6", "--out", str(tmp_path / "out")]
+    result = CliRunner().invoke(cli.app, ["trade", "fig10", *arguments])
+    assert result.exit_code == 0, result.stderr
+    written = json.loads((tmp_path / "out" / "fig10_trade.json").read_text())
+    assert written["model"] == "better_dipole" and written["provenance"]["parameters"]["tolerance"] == 0.6
+    assert (tmp_path / "out" / "fig10_trade.csv").read_text().startswith("model,error,bound,seconds_per_million,why")
+    assert "fig10_trade.csv" in result.stdout
+    blocked = CliRunner().invoke(cli.app, ["trade", "fig10", "--out", str(tmp_path / "out" / "fig10_trade.csv")])
+    assert blocked.exit_code == 2 and "is a file" in blocked.stderr
+
+
+@pytest.mark.parametrize(
+    ("medium", "r", "message"),
+    [((1.0, 0.2), (2.0, 1.0), "r must ascend"), ((0.0, 1.0), None, "medium must scatter, got albedo 0")],
+)
+def test_a_medium_or_a_range_without_light_is_refused(medium: tuple, r: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        recommend_flat(Medium(*medium), r)
+
+
+def test_without_an_argument_the_shipped_table_is_shown() -> None:
+    result = CliRunner().invoke(cli.app, ["trade"])
+    assert result.exit_code == 0, result.stderr
+    assert all(word in result.stdout for word in ("marble", "exact", "< ")) and " 0 ±" not in result.stdout
 
 
 def test_the_figure_and_the_page_are_drawn() -> None:

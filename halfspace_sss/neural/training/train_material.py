@@ -26,7 +26,7 @@ from halfspace_sss.neural.training.learners import MapPool, PaperLearner, Small
 from halfspace_sss.neural.universal import in_range, load_hypernetwork, shipped_weights
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
-from halfspace_sss.provenance import JsonDict, check_folder, provenance
+from halfspace_sss.provenance import JsonDict, check_folder, path_of, provenance
 
 VALIDATION_SEED = 104729
 VALIDATION_SETS = 4  # of 8 directions
@@ -191,7 +191,7 @@ def train_channel(
     fit_seconds = time.monotonic() - started - data_seconds
     record = {"width": learner.width, "depth": learner.depth, **training.record(learner)}
     record |= _record(medium, recipe, seed, error, history, data_seconds, fit_seconds)
-    path = Path(folder or weights_folder()) / weights_name(training.kind, medium)
+    path = path_of(folder or weights_folder()) / weights_name(training.kind, medium)
     save_weights(path, training.kind, network_arrays(learner.network()), record)
     return TrainedChannel(medium, path, error, data_seconds, fit_seconds)
 
