@@ -170,6 +170,10 @@ class SmallEmitters:
         small = distant | (self._row("radius", k) < LARGEST * size)
         return way / dr.maximum(size, 1e-20), small
 
+    def some_small(self, p: mi.Point3f) -> bool:
+        """Whether an emitter looks small from p."""
+        return bool(dr.any(self.direction(dr.arange(mi.UInt32, len(self)), p)[1]))
+
     def rounding(self, k: mi.UInt32) -> mi.Float:
         """A bound of how far from the surface of emitter k rounding puts points; 0 of one without."""
         return self._row("rounding", k)

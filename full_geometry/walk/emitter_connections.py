@@ -453,9 +453,13 @@ class EmitterDirections:
 def find_directions(
     scene: mi.Scene, media: WalkMedia, small: SmallEmitters | None, share: float, scored: bool = False
 ) -> EmitterDirections | None:
-    """Directions to the small emitters of a scene; None without any, or where no boundary refracts.
+    """Directions to the small emitters of a scene; None without any, where no boundary refracts, or where boundaries
+    are rough alone and every emitter looks large from all objects.
     `share`, `scored`: as of `SubpathConnections`; without connections there are no directions."""
     if small is None or share == 0 or not (media.any_refracts or media.any_rough):
+        return None
+    centres = [mi.Point3f(obj.shape.bbox().center()) for obj in media.objects]
+    if not (media.any_refracts or media.instance_table.repeated or any(map(small.some_small, centres))):
         return None
     alpha = mi.Float([_roughness(media.boundaries[kind]) for kind in media.instance_table.kind])
     dr.make_opaque(alpha)
