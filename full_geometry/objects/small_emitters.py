@@ -171,8 +171,9 @@ class SmallEmitters:
         return way / dr.maximum(size, 1e-20), small
 
     def some_small(self, p: mi.Point3f) -> bool:
-        """Whether an emitter looks small from p."""
-        return bool(dr.any(self.direction(dr.arange(mi.UInt32, len(self)), p)[1]))
+        """Whether an emitter looks small from one of the points p."""
+        k = dr.arange(mi.UInt32, dr.width(p) * len(self))
+        return bool(dr.any(self.direction(k % len(self), dr.gather(mi.Point3f, p, k // len(self)))[1]))
 
     def rounding(self, k: mi.UInt32) -> mi.Float:
         """A bound of how far from the surface of emitter k rounding puts points; 0 of one without."""

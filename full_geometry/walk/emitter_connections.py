@@ -24,7 +24,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.geometry.points import channel_mean, opaque, opposed, sided
+from full_geometry.geometry.points import channel_mean, floats, opaque, opposed, sided
 from full_geometry.geometry.rounding import before, blocked, place_bound, ray_from
 from full_geometry.geometry.shape import pointer_numbers
 from full_geometry.objects.small_emitters import SmallEmitters, spread
@@ -363,9 +363,13 @@ class EmitterDirections:
             d = dr.normalize(dr.select(cosine > 0, refracted, d))
 
         # ---- a lobe as wide as the emitter is seen inside: concentration eta² / (angle² + ((eta - 1) alpha)²)
-        alpha = dr.gather(mi.Float, self.alpha, self.media.place_of(k))
-        width2 = self.small.angle2(which, v) + dr.square((eta - 1) * alpha)
+        width2 = self.small.angle2(which, v) + self._lobe2(k)
         return d, dr.minimum(dr.square(eta) / dr.maximum(width2, 1e-6), 1e6), valid
+
+    def _lobe2(self, k: mi.Int32) -> mi.Float:
+        """Square of the angle over which the boundary of object k spreads a direction outside: ((eta - 1) alpha)²."""
+        alpha = dr.gather(mi.Float, self.alpha, self.media.place_of(k))
+        return dr.square((self.media.row("eta", k) - 1) * alpha)
 
     def light(self, event: Event, rng: mi.PCG32) -> tuple[mi.Spectrum, Score | tuple[()]]:
         """An estimate of the light of small emitters that leaves from an event, per weight of the walk; its slopes."""
@@ -421,9 +425,8 @@ class EmitterDirections:
         """An estimate of L_i inside of an emitter that is seen through the rough boundary of object k at `si`."""
         # ---- w by the BSDF with the probability q, the larger the emitter beside the lobe of w, else by the emitter
         boundary, angle2 = self.media.boundary(k), self.small.angle2(which, si.p)
-        lobe2 = dr.square((self.media.row("eta", k) - 1) * dr.gather(mi.Float, self.alpha, self.media.place_of(k)))
         delta = mi.UInt32(which) < self.small.n_delta
-        q = dr.select(delta, 0, angle2 / (angle2 + lobe2))
+        q = dr.select(delta, 0, angle2 / (angle2 + self._lobe2(k)))
         by_bsdf = choice < q
         w, distance, E = self.small.sample(which, si, u)
         bs, _ = boundary.sample(mi.BSDFContext(), si, choice / dr.maximum(q, 1e-6), u, by_bsdf)
@@ -458,9 +461,10 @@ def find_directions(
     `share`, `scored`: as of `SubpathConnections`; without connections there are no directions."""
     if small is None or share == 0 or not (media.any_refracts or media.any_rough):
         return None
-    centres = [mi.Point3f(obj.shape.bbox().center()) for obj in media.objects]
-    if not (media.any_refracts or media.instance_table.repeated or any(map(small.some_small, centres))):
-        return None
+    if not (media.any_refracts or media.instance_table.repeated):
+        centres = np.array([np.ravel(obj.shape.bbox().center()) for obj in media.objects])
+        if not small.some_small(mi.Point3f(*map(floats, centres.T))):
+            return None
     alpha = mi.Float([_roughness(media.boundaries[kind]) for kind in media.instance_table.kind])
     dr.make_opaque(alpha)
     return EmitterDirections(scene, media, small, alpha, scored)
