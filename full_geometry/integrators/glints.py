@@ -16,7 +16,6 @@ from typing import NamedTuple
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.ndimage import uniform_filter
 
 from full_geometry.geometry.points import of_rows
 from full_geometry.geometry.sensors import path_numbers, rays_by, sampled_size, seeded
@@ -50,16 +49,20 @@ def glint_light(
     (first, spp), number = samples, dr.width(glints.pixels)
     each = int(dr.prod(sampled_size(sensor.film()))) // (SHARE * number)
     each = 2 ** (min(max(each, PLACES), MOST_PLACES).bit_length() - 2)
-    low, high = (dr.repeat(v, spp * each) for v in glints[1:])
+    pixel = dr.arange(mi.UInt32, number * spp * each) // dr.opaque(mi.UInt32, spp * each)
+    low, high = (dr.gather(mi.Point2f, v, pixel) for v in glints[1:])
     area, result = (high.x - low.x) * (high.y - low.y), mi.Spectrum(0)
-    whole = dr.opaque(mi.Point2f, 0), dr.opaque(mi.Point2f, 1)
-    for half, (a, b) in enumerate((whole, (low, high))):
+    whole = dr.zeros(mi.Point2f, number), dr.full(mi.Point2f, 1, number)
+    dr.make_opaque(whole)
+    for half, rectangles in enumerate((whole, glints[1:])):
         # ---- places uniform in the pixel, or in its rectangle
         numbers = path_numbers(seeded(seed, 1 + half), number, first * each, spp * each)
+        a, b = (dr.gather(mi.Point2f, v, pixel) for v in rectangles)
         x = dr.clip(dr.lerp(a, b, numbers.next_2d()), a, b)  # rounding puts none beside its rectangle, where q is small
-        rays, weight, _ = rays_by(sensor, numbers, glints.pixels, x)
+        rays, weight = _rays(tracer, sensor, numbers, glints.pixels, x)
         q = 0.5 + dr.select(dr.all((x >= low) & (x <= high)), 0.5 / area, 0)
-        found = weight * tracer.seen_emission(tracer.shown(rays)) / q
+        found = weight * tracer.seen_emission(rays) / q
+        dr.eval(found)  # a sum evaluates what it is of: that of each channel would trace all rays anew
         result += mi.Spectrum([dr.block_sum(v, each) / (2 * each) for v in found])
     return result
 
@@ -67,81 +70,138 @@ def glint_light(
 def glints_of(tracer: PathTracer, sensor: mi.Sensor, trial: int) -> Glints:
     """Pixels in which emission seen in objects varies much more than other light, or a face may mirror a small emitter.
     `trial`: rays of each pixel that look for it."""
-    width, height = (int(v) for v in sampled_size(sensor.film()))
-    near, most = _near_mirrored(tracer, sensor), width * height // GLINTS
-    corners = _rectangles(tracer, sensor)
-    pixels = aligned(mi.UInt32, np.arange(width * height, dtype=np.uint32))
+    film = PixelGrid.of(sensor)
+    near, most = _near_mirrored(tracer, sensor, film), film.pixels // GLINTS
+    pixels, least = dr.arange(mi.UInt32, film.pixels), np.inf
+    dr.make_opaque(pixels)
     # of all pixels by few rays those about which it varies most, or may; of these by more rays
     for first, wide, kept in ((True, 5, CANDIDATES * most), (False, 3, most)):
-        more = min(max(TRIAL_RAYS * width * height // max(dr.width(pixels), 1), PLACES), MOST_PLACES)
+        more = min(max(TRIAL_RAYS * film.pixels // max(dr.width(pixels), 1), PLACES), MOST_PLACES)
         rays = trial if first else 2 ** (more.bit_length() - 1)
         numbers = path_numbers(seeded(0, 3, rays), dr.width(pixels), 0, rays)
-        places, weight, _ = rays_by(sensor, numbers, pixels)
-        light = np.array(weight * tracer.seen_emission(tracer.shown(places)), dtype=float)
-        light = light.reshape(len(light), -1, rays)
-        if first:  # other light is not asked for where nothing is seen
-            least = GLINT * _other_light(tracer, sensor) if light.any() or near.any() else np.inf
-        found = np.zeros((2, len(light), height * width))
-        found[..., np.array(pixels)] = light.mean(axis=2), (light**2).mean(axis=2)
-        means, squares = uniform_filter(found.reshape(2, -1, height, width), (0, 0, wide, wide))
-        variance = (squares - means**2).sum(axis=0).ravel()
-        variance[near] += np.inf if first else 0
-        number = min(int(np.count_nonzero(variance > least)), kept)
-        pixels = aligned(mi.UInt32, np.sort(np.argsort(variance)[len(variance) - number :]))
-        if number == 0:
+        places, weight = _rays(tracer, sensor, numbers, pixels)
+        light = mi.Spectrum(weight * tracer.seen_emission(places))
+        dr.eval(light)
+        if first and (dr.any(dr.max(light) > 0) or dr.any(near)):  # else no other light is asked for
+            least = GLINT * _other_light(tracer, sensor)
+        # Σ_c E[L_c²] - E[L_c]², by the pixels about each
+        light = [mi.Float64(v) for v in light]
+        moments = [*light, sum(v * v for v in light)]
+        moments = [film.scattered(dr.block_sum(v, rays) / rays, pixels) for v in moments]
+        *means, square = film.windowed(moments, wide)
+        variance = square - sum(mean * mean for mean in means)
+        if first:
+            variance = dr.select(near, dr.inf, variance)
+        pixels = _largest(variance, least, kept)
+        if dr.width(pixels) == 0:
             break
     # with those that faces tell of
-    on_faces = np.flatnonzero((corners[0] < corners[1]).all(axis=-1))
+    on_faces, corners = _rectangles(tracer, sensor, film)
     found = np.union1d(np.array(pixels), on_faces).astype(np.uint32)
-    low, high = corners.reshape(2, -1, 2)[:, found]
-    none = (low > high).any(axis=-1)
-    low[none], high[none] = 0, 1
+    low, high = np.zeros((len(found), 2)), np.ones((len(found), 2))
+    at = np.searchsorted(found, on_faces)
+    low[at], high[at] = corners
     return Glints(aligned(mi.UInt32, found), of_rows(mi.Point2f, low), of_rows(mi.Point2f, high))
 
 
-def _rectangles(tracer: PathTracer, sensor: mi.Sensor) -> np.ndarray:
-    """Of each pixel the corners of the rectangle about small reflections of small emitters in faces of meshes, (2,
-    height, width, 2), the first beyond the second in pixels without one."""
+def _rays(
+    tracer: PathTracer, sensor: mi.Sensor, numbers: mi.Sampler, pixels: mi.UInt32 | None = None,
+    places: mi.Point2f | None = None,
+) -> tuple[mi.Ray3f, mi.Spectrum]:  # fmt: skip
+    """Rays of pixels as the tracer shows them, and their weights, evaluated: Mitsuba has the film in their kernel."""
+    rays, weight, _ = rays_by(sensor, numbers, pixels, places)
+    rays = tracer.shown(rays)
+    dr.eval(rays, weight)
+    return rays, weight
+
+
+class PixelGrid(NamedTuple):
+    """Pixels of a film in rows, as data of kernels."""
+
+    width: int
+    height: int
+
+    @classmethod
+    def of(cls, sensor: mi.Sensor) -> PixelGrid:
+        """Those that rays of the sensor are sent through."""
+        return cls(*(int(v) for v in sampled_size(sensor.film())))
+
+    @property
+    def pixels(self) -> int:
+        """How many there are."""
+        return self.width * self.height
+
+    def beside(self, x: int, y: int) -> mi.UInt32:
+        """Of each pixel the number of that so far to the right and below; of the rim where there is none."""
+        width, height = (dr.opaque(mi.Int32, v) for v in self)
+        lane = dr.arange(mi.Int32, self.pixels)
+        column, row = lane % width + x, lane // width + y
+        return mi.UInt32(dr.clip(row, 0, height - 1) * width + dr.clip(column, 0, width - 1))
+
+    def scattered(self, values: mi.Float64, pixels: mi.UInt32) -> mi.Float64:
+        """Values of some pixels among all, 0 elsewhere."""
+        result = dr.zeros(mi.Float64, self.pixels)
+        dr.scatter(result, values, pixels)
+        return result
+
+    def windowed(self, values: list[mi.Float64], wide: int) -> list[mi.Float64]:
+        """Means over the `wide` x `wide` pixels about each."""
+        steps = range(-(wide // 2), wide // 2 + 1)
+        for beside in ([self.beside(k, 0) for k in steps], [self.beside(0, k) for k in steps]):
+            values = [sum(dr.gather(mi.Float64, v, j) for j in beside) / wide for v in values]
+            dr.eval(values)
+        return values
+
+
+def _largest(values: mi.Float64, least: float, most: int) -> mi.UInt32:
+    """Numbers of the largest values above `least`, in order, `most` of them at most."""
+    above = dr.compress(values > dr.opaque(mi.Float64, least))
+    if dr.width(above) <= most:
+        return above
+    found = np.array(dr.gather(mi.Float64, values, above))
+    return aligned(mi.UInt32, np.array(above)[np.sort(np.argsort(found)[len(found) - most :])])
+
+
+def _rectangles(tracer: PathTracer, sensor: mi.Sensor, film: PixelGrid) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of pixels with small reflections of small emitters in faces of meshes, and the corners of the rectangle
+    about these, (2, n, 2)."""
     # ---- rectangles about triangles, cut at the edges of up to four pixels
-    height, width = tuple(sampled_size(sensor.film()))[::-1]
-    result = np.stack([np.full((height, width, 2), np.inf), np.full((height, width, 2), -np.inf)])
     corners = mirroring_faces(tracer.visitor.scene, tracer.visitor.media, tracer.visitor.small, sensor)
-    low, high = corners.min(axis=1), corners.max(axis=1)
+    low, high, cut = corners.min(axis=1), corners.max(axis=1), []
     for step in np.ndindex(2, 2):
         x = np.floor(low).astype(int) + step
         a, b = np.maximum(low - x, 0), np.minimum(high - x, 1)
-        held = ((x >= 0) & (x < (width, height)) & (a < b)).all(axis=1)
-        at = x[held, 1], x[held, 0]
-        np.minimum.at(result[0], at, a[held])
-        np.maximum.at(result[1], at, b[held])
+        held = ((x >= 0) & (x < film) & (a < b)).all(axis=1)
+        cut.append((x[held] @ (1, film.width), a[held], b[held]))
+    number, a, b = (np.concatenate(part) for part in zip(*cut))
 
-    # ---- none of no area
-    seen = result[0] < result[1]
-    middle = np.where(seen, 0.5 * result.clip(0, 1).sum(axis=0), 0.5).clip(0.5 * SMALLEST, 1 - 0.5 * SMALLEST)
-    result[0][seen] = np.minimum(result[0], middle - 0.5 * SMALLEST)[seen]
-    result[1][seen] = np.maximum(result[1], middle + 0.5 * SMALLEST)[seen]
-    return result
+    # ---- one about all of a pixel, none of no area
+    number, at = np.unique(number, return_inverse=True)
+    low, high = np.full((len(number), 2), np.inf), np.full((len(number), 2), -np.inf)
+    np.minimum.at(low, at, a)
+    np.maximum.at(high, at, b)
+    middle = (0.5 * (low + high)).clip(0.5 * SMALLEST, 1 - 0.5 * SMALLEST)
+    return number, np.stack([np.minimum(low, middle - 0.5 * SMALLEST), np.maximum(high, middle + 0.5 * SMALLEST)])
 
 
-def _near_mirrored(tracer: PathTracer, sensor: mi.Sensor) -> np.ndarray:
+def _near_mirrored(tracer: PathTracer, sensor: mi.Sensor, film: PixelGrid) -> mi.Bool:
     """Whether what pixels mirror is as near to the rim of a small emitter as to what the next ones mirror."""
-    width, height = (int(v) for v in sampled_size(sensor.film()))
-    small, result = tracer.visitor.small, np.zeros(width * height, dtype=bool)
+    small, result = tracer.visitor.small, dr.opaque(mi.Bool, False, film.pixels)
     if small is None:
         return result
-    rays, _, _ = rays_by(sensor, path_numbers(seeded(0, 4), width * height, 0, 1))
-    o, d, mirrors = tracer.mirrored(tracer.shown(rays))
+    rays, _ = _rays(tracer, sensor, path_numbers(seeded(0, 4), film.pixels, 0, 1))
+    o, d, mirrors = tracer.mirrored(rays)
+    dr.eval(o, d, mirrors)
     for k in range(small.n_delta, len(small)):
         k = dr.opaque(mi.UInt32, k)
-        off = np.array(dr.select(mirrors, d - small.direction(k, o)[0], dr.nan)).reshape(3, height, width)
-        step = np.full((height, width), np.nan)
-        for axis in (0, 1):
-            change = np.linalg.norm(np.diff(off, axis=axis + 1), axis=0)
-            ends = [(0, 0), (0, 0)]
-            for ends[axis] in ((0, 1), (1, 0)):
-                step = np.fmax(step, np.pad(change, ends, constant_values=np.nan))
-        rim = np.array(dr.sqrt(small.angle2(k, o)) + dr.zeros(mi.Float, width * height)).reshape(height, width)
-        result |= (np.abs(np.linalg.norm(off, axis=0) - rim) < NEAR * step).ravel()
+        off, step = mi.Vector3f(d - small.direction(k, o)[0]), mi.Float(-1)
+        dr.eval(off)
+        for x, y in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+            j = film.beside(x, y)
+            both = mirrors & dr.gather(mi.Bool, mirrors, j)
+            step = dr.maximum(step, dr.select(both, dr.norm(dr.gather(mi.Vector3f, off, j) - off), -1))
+        result |= mirrors & (dr.abs(dr.norm(off) - dr.sqrt(small.angle2(k, o))) < NEAR * step)
+    dr.eval(result)
     return result
 
 
@@ -149,8 +209,8 @@ def _other_light(tracer: PathTracer, sensor: mi.Sensor) -> float:
     """The mean square of the light of objects without the emission seen in them."""
     pixels = int(dr.prod(sampled_size(sensor.film())))
     pixels = aligned(mi.UInt32, np.linspace(0, pixels - 1, LIT_RAYS).astype(np.uint32))
-    rays, weight, _ = rays_by(sensor, path_numbers(seeded(0, 2), LIT_RAYS, 0, 1), pixels)
+    rays, weight = _rays(tracer, sensor, path_numbers(seeded(0, 2), LIT_RAYS, 0, 1), pixels)
     apart = dr.opaque(mi.Bool, True, LIT_RAYS)
-    L, hit, _ = replace(tracer, apart=apart).trace(tracer.shown(rays), on_device(PATH_LANES), (0, 2))
+    L, hit, _ = replace(tracer, apart=apart).trace(rays, on_device(PATH_LANES), (0, 2))
     light = np.array(weight * L, dtype=float)[:, np.array(hit)]
     return float((light**2).sum() / max(light.shape[1], 1))

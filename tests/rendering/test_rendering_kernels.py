@@ -90,18 +90,23 @@ def test_a_scene_again_compiles_nothing_wherever_numpy_has_put_its_numbers(model
     assert len(hashes[0]) > 10 and not hashes[2] - (hashes[0] | hashes[1])
 
 
-def _of_size(rng: np.random.Generator, light: str = "sampled") -> dict[str, int]:
-    """Operations by hash of all kernels of walks in a ball of random size and medium, under a sky, lamp and point."""
+def _ball(rng: np.random.Generator, light: str = "sampled", side: int = 4):
+    """Walks in a ball of random size and medium, under a sky, lamp and point."""
     view = mi.ScalarTransform4f().look_at([3, 4, 19], [0, 0, 0], [0, 1, 0])
-    film = {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}}
+    film = {"type": "hdrfilm", "width": side, "height": side, "rfilter": {"type": "box"}}
     wax = {"type": "translucent", "sigma_t": rng.uniform(0.5, 4), "albedo": rng.uniform(0.3, 0.99)}
     lamp = {"type": "sphere", "center": [4, 5, 9], "radius": rng.uniform(0.3, 0.6), "emitter": {"type": "area"}}
-    scene = mi.load_dict({
+    return mi.load_dict({
         "type": "scene", "integrator": {"type": "translucent_walk", "light": light}, "sky": {"type": "constant"},
         "ball": {"type": "sphere", "radius": rng.uniform(2, 4), "bsdf": wax}, "lamp": lamp,
         "bulb": {"type": "point", "position": [-rng.uniform(4, 6), 5, 9]},
         "sensor": {"type": "perspective", "to_world": view, "film": film},
     })  # fmt: skip
+
+
+def _of_size(rng: np.random.Generator, light: str = "sampled") -> dict[str, int]:
+    """Operations by hash of all kernels of `_ball`."""
+    scene = _ball(rng, light)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         np.array(mi.render(scene, spp=4))
@@ -119,6 +124,26 @@ def test_one_kernel_traces_paths_of_the_image_and_those_that_tell_its_glints():
     """The largest kernel of an image: it takes seconds to compile on a GPU."""
     operations = sorted(_of_size(np.random.default_rng(1), "precomputed").values())
     assert operations[-2] < 0.9 * operations[-1]
+
+
+def test_glints_of_all_channels_are_traced_at_once_in_films_of_all_sizes():
+    from full_geometry.integrators.glints import Glints, glint_light, glints_of
+
+    found = []
+    for side in (4, 6):
+        gc.collect()
+        scene = _ball(np.random.default_rng(1), "precomputed", side)
+        sensor, tracer = scene.sensors()[0], scene.integrator().tracer(scene, 0, 16)
+        glints = Glints(mi.UInt32(1, 2), mi.Point2f(0, [0.2, 0.4]), mi.Point2f(1, [0.6, 0.8]))
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True), dr.suspend_grad():
+            dr.kernel_history_clear()
+            dr.eval(glint_light(tracer, sensor, glints, 0, (0, 4)))
+            glints_of(tracer, sensor, 2)
+            kernels = dr.kernel_history([dr.KernelType.JIT])
+        found.append([kernel["hash"] for kernel in kernels if 1000 < kernel["operation_count"] < 4000])
+        del scene, tracer
+    # two halves of a pixel, and one search
+    assert [len(each) for each in found] == [3, 3] and set(found[0]) == set(found[1])
 
 
 def test_the_mean_over_channels_is_that_of_numbers():
