@@ -55,6 +55,7 @@ LAYER = ["emission.R", "emission.G", "emission.B"]
 SAMPLES_PER_RAY = 4  # of the image, for each ray of light: these take a tenth of the time or less
 SAMPLES_PER_PATH = 4  # the same for each path of scattered light; of milk in glass and a statue, 8, 2 and 1 were worse
 FEWEST_RAYS, MOST_RAYS = 2**16, 2**21
+PREVIEW_RAYS = 2**14  # of a first look at light that has changed
 FOREVER, DEPTHS = 2**31 - 1, {"max_depth": -1, "rr_depth": 5}
 WIDEST = 20.0  # blur: 1 and 3 radians
 Keep = Callable[[FirstExits], None]
@@ -130,7 +131,7 @@ def _class(variant: str) -> type:
 
         def tracer(
             self, scene: mi.Scene, seed: int = 0, samples: int = 0, scored: bool = False,
-            light: UnscatteredLight | None = None, exits: bool = False,
+            light: UnscatteredLight | None = None, exits: bool = False, fewest: int = FEWEST_RAYS,
         ) -> PathTracer:  # fmt: skip
             """What paths through a scene need; its objects are made ready once, its emitters may have been edited.
 
@@ -140,6 +141,7 @@ def _class(variant: str) -> type:
                 scored: whether derivatives are asked for, which leave light to be sampled.
                 light: that is known already.
                 exits: whether walks have to leave, so that scattered light is not precomputed.
+                fewest: rays of light of each object.
             """
             # ---- objects and inner lights, made once for a scene
             media, small = self.media(scene), SmallEmitters.of(scene)
@@ -150,7 +152,7 @@ def _class(variant: str) -> type:
                 if self._cells[0] is not media:
                     self._cells = media, inside_cells_of(media, *self._cells)
                 if light is None:
-                    started, rays = clock(), min(max(samples // SAMPLES_PER_RAY, FEWEST_RAYS), MOST_RAYS)
+                    started, rays = clock(), min(max(samples // SAMPLES_PER_RAY, fewest), MOST_RAYS)
                     ends = holds_scattered(media) and inner is None and self.max_depth == FOREVER and not exits
                     paths = samples // SAMPLES_PER_PATH + 1 if ends else 0
                     light = unscattered_light(scene, media, seed, self._cells[1], rays, paths)
@@ -204,6 +206,23 @@ def _class(variant: str) -> type:
                 tracer = self.tracer(scene, seed, samples, light=light, exits=keep is not None)
                 _render(tracer, sensor, seed, spp, keep, False, self._glints_in(scene, tracer, sensor, spp))
                 return sensor.film().develop() if develop else None
+
+        def preview(
+            self, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int, glints: bool = False
+        ) -> mi.TensorXf:  # fmt: skip
+            """The image by the light inside that is kept, which outlives the camera: a look at a scene that changes.
+
+            Once objects or emitters have changed, a little light is found anew; `prepare` finds more.
+            `glints`: whether many places of their pixels are asked for them, which a search has to find.
+            """
+            with interruptible(), undisturbed(), dr.suspend_grad():
+                state = light_state(scene)
+                if self._kept[0] != state:
+                    self._kept = state, self.tracer(scene, seed, 1, fewest=PREVIEW_RAYS).visitor.unscattered
+                tracer = self.tracer(scene, seed, 1, light=self._kept[1])
+                found = self._glints_in(scene, tracer, sensor, spp) if glints else None
+                _render(tracer, sensor, seed, spp, None, False, found)
+                return sensor.film().develop()
 
         def _glints_in(self, scene: mi.Scene, tracer: PathTracer, sensor: mi.Sensor, spp: int) -> Glints | None:
             """`glints_of`, the same for all images of a view; None where that emission is met by chance.

@@ -61,7 +61,7 @@ FEWEST_POINTS, MOST_POINTS = 2**14, 2**18  # of the surface that find its cells,
 MOST_INTEGER = 2**15 - 1  # of 16 bits, for a direction of 1
 MOST_BENT = math.radians(35)  # of 29 light was within .5 %, of 38 to 55 it was 1 to 5 % too bright
 MOST_TRUNCATED = 0.1  # abs(g) beside textures of media: at 0.3 and 0.5 light under a lamp was 2 to 3 % off
-FEWEST_PATHS = 2**14  # of scattered light, from each object
+FEWEST_PATHS, RAYS_PER_PATH = 2**14, 4  # of scattered light from each object, if it has so many rays for each
 ROULETTE = 0.1  # part of its light below which a reflected ray may end
 
 
@@ -151,7 +151,7 @@ def unscattered_light(
     dr.make_opaque(light)
     found = UnscatteredLight(index, *light, tables, forward(media))
     if paths:
-        found = _with_paths(scene, media, seed, found, cells, paths)
+        found = _with_paths(scene, media, seed, found, cells, paths, min(FEWEST_PATHS, rays // RAYS_PER_PATH))
     dr.sync_thread()  # callers time this
     return found
 
@@ -180,9 +180,11 @@ def _in_one_table(cells: list[InsideCells]) -> tuple[CellIndex, dict[str, Any]]:
 
 
 def _with_paths(
-    scene: mi.Scene, media: WalkMedia, seed: int, light: UnscatteredLight, cells: list[InsideCells], paths: int
-) -> UnscatteredLight:
-    """Light with the fit of what paths from the emitters bring to the cells of all objects, see `scattered_light`."""
+    scene: mi.Scene, media: WalkMedia, seed: int, light: UnscatteredLight, cells: list[InsideCells], paths: int,
+    fewest: int,
+) -> UnscatteredLight:  # fmt: skip
+    """Light with the fit of what paths from the emitters bring to the cells of all objects, see `scattered_light`.
+    `fewest`: paths from each."""
     # ---- paths from all objects, which pass from one to another
     n, slots = 4 * len(mi.Spectrum(0)), sum(grid.slots for grid in cells)
     D = dr.zeros(mi.Float, 2 * n * slots)
@@ -192,7 +194,7 @@ def _with_paths(
     starts = media.lit_from_outside
     flux = np.array([tracer.flux(k, seed) for k in starts] if len(starts) > 1 else [1.0])
     for k, share in zip(starts, flux / max(flux.sum(), 1e-30)):
-        tracer.trace(k, max(int(share * paths), FEWEST_PATHS), seed)
+        tracer.trace(k, max(int(share * paths), fewest), seed)
 
     # ---- the fit of each: L_s, then L_u, which has not scattered
     parts, first = [], 0

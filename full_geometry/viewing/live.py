@@ -6,6 +6,7 @@ import gc
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +17,7 @@ import numpy as np
 from full_geometry.geometry.sensors import seeded
 from full_geometry.geometry.snapshot import differing
 from full_geometry.integrators.bssrdf import is_bssrdf
+from full_geometry.integrators.translucent_walk import MOST_RAYS, SAMPLES_PER_RAY
 from full_geometry.objects.objects import translucent_shapes
 from full_geometry.scenes.gltf import is_gltf
 from full_geometry.scenes.reference import check_sensor
@@ -43,6 +45,7 @@ from halfspace_sss.provenance import write_atomically
 COARSE = 4  # one of so many pixels of each row and column comes first
 BRIEF = 0.15  # seconds; passes that take longer have no more samples, as edits wait for one
 SHARE = 4  # a pass has at most a quarter of the samples so far
+LIT = 2  # samples; at twice as many, walks find more light than a preview has, and glints
 MOST = 4096  # samples of a pixel
 GUIDE_SPP = 4
 MAPS = (".exr", ".hdr")
@@ -211,16 +214,22 @@ class LiveScene:
         Work is cancelled by `halfspace_sss.interrupts.cancellable`, and then leaves what is known whole. ValueError if
         the integrator refuses the scene."""
         started, integrator, denoise = time.perf_counter(), self.integrator(way), None
-        # the walks of a correction come after the first image
-        draw = integrator.preview if is_bssrdf(integrator) else integrator.render
-        coarse = image_of(draw, self.scene, camera.sensor(COARSE), seed, 1)
+        # the walks of a correction, and more light for walks, come after the first image
+        coarse = image_of(integrator.preview, self.scene, camera.sensor(COARSE), seed, 1)
         ready = time.perf_counter() - started
         rows, columns = (np.arange(n) * m // n for n, m in zip((camera.height, camera.width), coarse.shape))
         yield Shown(coarse[rows][:, columns, :3], 0, math.inf, ready, ready, ())
-        sensor, mean, spp, told = camera.sensor(), None, 1, None
+        sensor, mean, spp, told, lit = camera.sensor(), None, 1, None, LIT
         while mean is None or mean.spp < MOST:
-            begun = time.perf_counter()
-            image = image_of(integrator.render, self.scene, sensor, seeded(seed, mean.passes if mean else 0), spp)
+            begun, number, draw = time.perf_counter(), seeded(seed, mean.passes if mean else 0), integrator.render
+            if not is_bssrdf(integrator):
+                # light inside serves passes until there are twice as many samples, as it takes longer than a pass
+                pixels = camera.width * camera.height
+                if mean is not None and mean.spp >= lit + min(lit, MOST_RAYS * SAMPLES_PER_RAY / pixels):
+                    lit = mean.spp
+                    integrator.prepare(self.scene, lit * pixels, number)
+                draw = partial(integrator.preview, glints=lit > LIT)
+            image = image_of(draw, self.scene, sensor, number, spp)
             last = time.perf_counter() - begun
             mean = (mean or Reference.empty(image.shape, {})).add(image, spp, last)
             if told is None:

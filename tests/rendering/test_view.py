@@ -93,6 +93,28 @@ def test_images_are_those_of_the_scene_that_is_saved(live: LiveScene, edits: Edi
     assert found.spp == 2 and 0 < found.error < 1
 
 
+@pytest.mark.slow
+def test_walks_keep_the_light_inside_while_the_camera_moves(live: LiveScene, monkeypatch: pytest.MonkeyPatch) -> None:
+    from full_geometry.integrators import translucent_walk
+
+    way, filled, find = Way("path_traced", "precomputed"), [], translucent_walk.unscattered_light
+
+    def counted(*args: Any) -> object:
+        filled.append(args[4])
+        return find(*args)
+
+    monkeypatch.setattr(translucent_walk, "unscattered_light", counted)
+    live.apply(Edits())
+    camera = live.camera(64)
+    shown = [each for each in itertools.islice(live.passes(camera, way), 6)][-1]
+    assert filled == [translucent_walk.PREVIEW_RAYS, translucent_walk.FEWEST_RAYS] and shown.spp == 5
+    list(itertools.islice(live.passes(camera._replace(fov=50.0), way), 3))
+    assert len(filled) == 2
+    live.apply(Edits(turn=40))
+    _last(live, camera, way)
+    assert filled[2:] == [translucent_walk.PREVIEW_RAYS]
+
+
 @pytest.mark.parametrize("medium", [{}, OWN, {"material": "ketchup"}], ids=["own", "numbers", "material"])
 def test_a_rough_boundary_has_the_index_of_its_medium(live: LiveScene, medium: dict[str, Any]) -> None:
     live.apply(Edits(media={"ball": {**medium, "roughness": 0.2}}))
