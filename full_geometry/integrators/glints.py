@@ -132,7 +132,7 @@ class PixelGrid(NamedTuple):
         return self.width * self.height
 
     def beside(self, x: int, y: int) -> mi.UInt32:
-        """Of each pixel the number of that so far to the right and below; of the rim where there is none."""
+        """Numbers of the pixels so far to the right of each and below; of the rim where there are none."""
         width, height = (dr.opaque(mi.Int32, v) for v in self)
         lane = dr.arange(mi.Int32, self.pixels)
         column, row = lane % width + x, lane // width + y
