@@ -26,7 +26,7 @@ import pytest
 import quick_kernels
 import quick_light
 import typer.testing
-from rendered import one_thread
+from one_thread import work_in_one_thread
 
 import halfspace_sss
 from benchmarks.truths import TABLE
@@ -66,6 +66,8 @@ def pytest_collection_finish() -> None:
     """Compile kernels in a quarter of the time, and look through no modules where garbage is collected."""
     if "drjit" in sys.modules:
         quick_kernels.compile_quickly()
+    if "PYTEST_XDIST_WORKER" in os.environ and "mitsuba" in sys.modules:
+        work_in_one_thread()
     gc.freeze()
 
 
@@ -148,15 +150,6 @@ def _set_variant(name: str) -> None:
         if not isinstance(getattr(mi, load), functools.partial):
             # several threads number the shapes by chance: other kernels would be compiled for the same scene
             setattr(mi, load, functools.partial(getattr(mi, load), parallel=False))
-    if name.startswith("llvm"):
-        from full_geometry.integrators import bssrdf, translucent_walk
-
-        for integrator in (bssrdf.integrator_class(), translucent_walk.walk_integrator_class()):
-            for work in ("prepare", "render"):
-                function = getattr(integrator, work, None)
-                if function and not hasattr(function, "__wrapped__"):
-                    # a second thread spins between launches: a third of the CPU seconds of images of few samples
-                    setattr(integrator, work, functools.wraps(function)(one_thread()(function)))
 
 
 @pytest.fixture

@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
-import threading
-from collections.abc import Iterator
-
 import numpy as np
 
 MEDIUM = {"sigma_s": 1.0, "sigma_a": 0.2, "g": 0.3, "eta": 1.4}
@@ -48,37 +43,6 @@ def render(scene: dict, spp: int, seed: int = 1) -> np.ndarray:
     return np.array(mi.render(mi.load_dict(scene), spp=spp, seed=seed))
 
 
-_lock, _inside, _threads = threading.Lock(), 0, 0
-
-
-@contextlib.contextmanager
-def one_thread() -> Iterator[None]:
-    """Let Dr.Jit work in one thread where tests run side by side: a second one spins between launches.
-
-    The last to leave gives the others back, without which Mitsuba waits forever for EXR files.
-    """
-    global _inside, _threads
-    import drjit as dr
-
-    if "PYTEST_XDIST_WORKER" not in os.environ:
-        yield
-        return
-    with _lock:
-        if _inside == 0:
-            dr.sync_thread()
-            _threads = dr.thread_count()
-            dr.set_thread_count(1)
-        _inside += 1
-    try:
-        yield
-    finally:
-        with _lock:
-            _inside -= 1
-            if _inside == 0:
-                dr.sync_thread()
-                dr.set_thread_count(_threads)
-
-
 LANES = 2**21  # of a launch; beyond, what it takes to trace a render in Python is small
 
 
@@ -99,10 +63,7 @@ def independent(scene, n: int, spp: int, seed: int = 1, **film) -> np.ndarray:
     film = {"type": "hdrfilm", "width": beside * width, "height": height, "rfilter": {"type": "box"},
             "pixel_format": "rgb", "component_format": "float32", **film}  # fmt: skip
     batch = mi.load_dict({"type": "batch", "film": film, **{f"view{k}": sensor for k in range(beside)}})
-    with one_thread():
-        images = [
-            np.array(mi.render(scene, sensor=batch, spp=spp, seed=seed + k), dtype=float) for k in range(n // beside)
-        ]
+    images = [np.array(mi.render(scene, sensor=batch, spp=spp, seed=seed + k), dtype=float) for k in range(n // beside)]
     return np.concatenate([image.reshape(height, beside, width, -1).swapaxes(0, 1) for image in images])
 
 

@@ -80,6 +80,7 @@ import shlex
 import sys
 import time
 
+import one_thread
 import quick_kernels
 import quick_light
 from figures import fig09, fig10
@@ -94,6 +95,7 @@ from halfspace_sss.neural.training.train_material import FAST
 import halfspace_sss.neural.training.train_material
 
 quick_kernels.compile_quickly()
+one_thread.work_in_one_thread()
 fig09.SHOWN, fig09.MODELS, fig09.SIZES = {"draft": ("ketchup",)}, ("better_dipole",), {"draft": 12}
 fig09.MODEL_SPP["draft"], fig09.TRUTH_SPP["draft"] = 4, 16
 reflectance_curves.evaluations_per_s.__defaults__ = (4096, 0.01)

@@ -51,11 +51,13 @@ import os
 import sys
 import traceback
 
+import one_thread
 import quick_kernels
 import quick_light
 from full_geometry import inverse
 
 quick_kernels.compile_quickly()
+one_thread.work_in_one_thread()
 quick_light.gather_by_few(setattr)
 fit = inverse.fit
 inverse.fit = lambda *arguments, settings: fit(*arguments, settings=dataclasses.replace(settings, steps=2))
