@@ -223,7 +223,7 @@ class OutgoingLight:
         place = self.media.place_of(k)
         row = dr.gather(dict, self.tables, place)
         active = active & row["known"] & ((within == row["within"]) if len(within) else True)
-        active = way_in_is_clear(self.media, si, k, w, active)
+        active = way_in_is_clear(self.media, si, k, w, row["eta"], active)
         out, a, R = surface_point(si.p, si.n, si.sh_frame.n, w), mi.Spectrum(0), mi.Spectrum(1)
         # a(w) and R of each object, with the medium that textures have here
         for kind in range(len(self.media.objects)):
@@ -236,13 +236,14 @@ class OutgoingLight:
 
 
 def way_in_is_clear(
-    media: WalkMedia, si: mi.SurfaceInteraction3f, k: mi.Int32, w: mi.Vector3f, active: mi.Bool
+    media: WalkMedia, si: mi.SurfaceInteraction3f, k: mi.Int32, w: mi.Vector3f, eta: mi.Float, active: mi.Bool
 ) -> mi.Bool:
     """Whether the straight way in of what leaves object k along w meets nothing inside, as far as a flight gets.
-    Things inside have edges there, which no smooth function of directions follows."""
+    Things inside have edges there, which no smooth function of directions follows.
+    `eta`: index of the boundary to what is around the object, such as glass."""
     if media.inner is None:
         return active
-    d = -bent(w, dr.select(dr.dot(si.n, w) > 0, si.n, -si.n), media.row("eta", k))
+    d = -bent(w, dr.select(dr.dot(si.n, w) > 0, si.n, -si.n), eta)
     o, off = media.depart(si, d, mi.Bool(True))
     ray = mi.Ray3f(o + off, d)
     ray.maxt = -math.log(FLIGHT) / dr.min(media.spectrum("sigma_t", k))
