@@ -77,16 +77,17 @@ def _last(live: LiveScene, camera: Camera, way: Way) -> Shown:
     ],
     ids=["light", "environment", "medium", "index"],
 )
-def test_images_are_those_of_the_scene_that_is_saved(live: LiveScene, edits: Edits, kept: bool) -> None:
+@pytest.mark.parametrize("walks", [False, True], ids=["model", "walks"])
+def test_images_are_those_of_the_scene_that_is_saved(live: LiveScene, edits: Edits, kept: bool, walks: bool) -> None:
     live.apply(Edits())
-    before, camera = live.scene, live.camera(64)
-    plain = _last(live, camera, live.way)
+    before, camera, way = live.scene, live.camera(64), Way("path_traced", "precomputed") if walks else live.way
+    plain = _last(live, camera, way)
     live.apply(edits)
     assert (live.scene is before) == kept
-    found = _last(live, camera, live.way)
-    assert live.save("saved.xml", live.way, camera, edits).startswith("halfspace-sss render")
+    found = _last(live, camera, way)
+    assert live.save("saved.xml", way, camera, edits).startswith("halfspace-sss render")
     fresh = LiveScene(live.folder / "saved.xml")
-    assert fresh.way == live.way
+    assert fresh.way == way
     wanted = _last(fresh, fresh.camera(64), fresh.way)
     np.testing.assert_allclose(found.image, wanted.image, rtol=1e-3, atol=1e-4)
     assert np.abs(found.image - plain.image).mean() > 1e-2
