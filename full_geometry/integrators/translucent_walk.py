@@ -127,7 +127,8 @@ def _class(variant: str) -> type:
             Raises:
                 ValueError: light cannot be precomputed in this scene, and is asked for.
             """
-            self._kept = light_state(scene), self.tracer(scene, seed, samples).visitor.unscattered
+            with interruptible(), undisturbed(), dr.suspend_grad():
+                self._kept = light_state(scene), self.tracer(scene, seed, samples).visitor.unscattered
 
         def tracer(
             self, scene: mi.Scene, seed: int = 0, samples: int = 0, scored: bool = False,

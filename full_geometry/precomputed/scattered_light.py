@@ -46,6 +46,7 @@ from full_geometry.walk.random_walk import (
     skip,
     start_walk,
 )
+from halfspace_sss.interrupts import checkpoint
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 FEW = 3  # dragon of marble: 2, 3 and 5 have 20, 13 and 7 times less variance x time, ever less of the noise of cells
@@ -90,6 +91,7 @@ class ScatteredLight(Visitor):
         """Add the light of so many paths that begin on object or glass k, or a few more."""
         parts = math.ceil(number / AT_ONCE)
         for part in range(parts):
+            checkpoint()
             starts = self._starts(k, math.ceil(number / parts), parts, (seed, k, part))
             if starts is not None:
                 self._trace(starts, (seed, k, part))

@@ -17,7 +17,6 @@ import numpy as np
 from full_geometry.geometry.sensors import seeded
 from full_geometry.geometry.snapshot import differing
 from full_geometry.integrators.bssrdf import is_bssrdf
-from full_geometry.integrators.translucent_walk import MOST_RAYS, SAMPLES_PER_RAY
 from full_geometry.objects.objects import translucent_shapes
 from full_geometry.scenes.gltf import is_gltf
 from full_geometry.scenes.reference import check_sensor
@@ -38,6 +37,7 @@ from full_geometry.viewing.edits import (
     put_camera,
     put_integrator,
 )
+from full_geometry.walk.random_walk import on_device
 from halfspace_sss.interrupts import cancellable
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import write_atomically
@@ -45,6 +45,7 @@ from halfspace_sss.provenance import write_atomically
 COARSE = 4  # one of so many pixels of each row and column comes first
 BRIEF = 0.15  # seconds; passes that take longer have no more samples, as edits wait for one
 SHARE = 4  # a pass has at most a quarter of the samples so far
+SAMPLES_OF_LIGHT = 2**20  # that light inside serves at most, as edits wait for it
 LIT = 2  # samples; at twice as many, walks find more light than a preview has, and glints
 MOST = 4096  # samples of a pixel
 GUIDE_SPP = 4
@@ -224,10 +225,10 @@ class LiveScene:
             begun, number, draw = time.perf_counter(), seeded(seed, mean.passes if mean else 0), integrator.render
             if not is_bssrdf(integrator):
                 # light inside serves passes until there are twice as many samples, as it takes longer than a pass
-                pixels = camera.width * camera.height
-                if mean is not None and mean.spp >= lit + min(lit, MOST_RAYS * SAMPLES_PER_RAY / pixels):
+                pixels, most = camera.width * camera.height, on_device(SAMPLES_OF_LIGHT)
+                if mean is not None and mean.spp >= lit + min(lit, most / pixels):
                     lit = mean.spp
-                    integrator.prepare(self.scene, lit * pixels, number)
+                    integrator.prepare(self.scene, min(lit * pixels, most), number)
                 draw = partial(integrator.preview, glints=lit > LIT)
             image = image_of(draw, self.scene, sensor, number, spp)
             last = time.perf_counter() - begun
