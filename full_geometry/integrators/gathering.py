@@ -387,7 +387,7 @@ def _leaving(
 
     # ---- what S along directions of light has beyond T; averages over the neighbourhood would cross edges of textures
     if obj.textured is None:
-        direct = np.maximum(rays.light.sum(axis=1) / T.around.whole - c, 0)
+        direct = np.maximum(rays.whole / T.around.whole - c, 0)
         B += T.beyond(direct.astype(np.float32), rays)
 
     # ---- four numbers for each channel of a point, as data of a kernel
@@ -450,21 +450,25 @@ def _incident(
     w_e += dr.zeros(mi.Float, rows * n)  # without an emitter it has one lane
     dr.eval(values, each_light, w_e, w_c)
 
-    # ---- lanes in the order of rows and directions again
-    j, s = lane // each, lane % each
-    order = dr.select(s % TRACED == 0, j * few + s // TRACED, all_few + j * (each - few) + s - s // TRACED - 1)
+    # ---- the lane of direction s of row j, and sums over the directions of each row
+    def lane_of(j: mi.UInt32, s: mi.UInt32) -> mi.UInt32:
+        return dr.select(s % TRACED == 0, j * few + s // TRACED, all_few + j * (each - few) + s - s // TRACED - 1)
+
+    order = lane_of(lane // each, lane % each)
     sums = [dr.block_sum(dr.gather(mi.Float, v, order), n) for value in values for v in value]
     dr.eval(sums)
     found = np.stack([np.array(v, dtype=float) for v in sums], axis=1).reshape(rows, len(values), -1) / n
-    at = np.array(order)
 
     # ---- rays of each point: directions of emitters, then of the cosine, of all parts
-    def by_point(v: mi.Vector3f | mi.Spectrum) -> np.ndarray:
-        v = np.array(v).T[at].reshape(parts, count, n, -1)
-        return np.moveaxis(v, 0, 1).reshape(count, parts * n, -1)
-
-    w, light = (np.concatenate([by_point(v) for v in both], axis=1) for both in ((w_e, w_c), each_light))
-    rays = Rays(w, light / (parts * n))
+    number, total = dr.arange(mi.UInt32, 2 * rows * n), _numbers(parts * n)[0]
+    part, point = number % total // each, number // (2 * total)
+    at = lane_of(part * _numbers(count)[0] + point, number % each)
+    aimed_at = number // total % 2 == 0
+    w, light = (
+        dr.select(aimed_at, *(dr.gather(type(v), v, at) for v in both))
+        for both in ((w_e, w_c), map(mi.Spectrum, each_light))
+    )
+    rays = Rays.of(w, light / mi.Float(total), found[:, 0].reshape(parts, count, -1).mean(axis=0))
     return [_of_part(T.points, around, found[k * count : (k + 1) * count]) for k in range(parts)], rays
 
 

@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.geometry.light_points import GOLDEN
-from full_geometry.geometry.points import EntrySample, SurfacePoint, of_rows
+from full_geometry.geometry.points import EntrySample, SurfacePoint, channel_mean, of_rows
 from full_geometry.objects.objects import TranslucentObject
 from halfspace_sss.arrays import aligned
 
@@ -24,11 +24,28 @@ ANY = 0.1  # and of them by no light
 
 
 class Rays(NamedTuple):
-    """Directions along which light was gathered at points.
-    `w`: (points, directions, 3). `light`: a(mu) mu L over their density and number, (points, directions, channels)."""
+    """Directions along which light was gathered at points, those of each point beside each other.
+    `w`: all directions. `light`: a(mu) mu L over their density and number. `brightness`: its mean over channels,
+    (points, directions). `whole`: its sum at each point, (points, channels)."""
 
-    w: np.ndarray
-    light: np.ndarray
+    w: mi.Vector3f
+    light: mi.Spectrum
+    brightness: np.ndarray
+    whole: np.ndarray
+
+    @classmethod
+    def of(cls, w: mi.Vector3f, light: mi.Spectrum, whole: np.ndarray) -> Rays:
+        """Rays with their brightness; all but that stays on the device."""
+        brightness = channel_mean(light)
+        dr.eval(w, light, brightness)
+        return cls(w, light, np.array(brightness).reshape(len(whole), -1), whole)
+
+    def some(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Directions and light of rays by their numbers, (n, 3) and (n, channels)."""
+        found = dr.gather(tuple, (self.w, self.light), aligned(mi.UInt32, numbers))
+        dr.eval(found)
+        w, light = (np.stack([np.array(v) for v in part], axis=1) for part in found)
+        return w, light
 
 
 class LitPairs(NamedTuple):
@@ -61,11 +78,11 @@ def lit_pairs(brought: np.ndarray, point: np.ndarray, rays: Rays) -> LitPairs:
     u[order] = (np.arange(len(at)) - np.searchsorted(sorted_at, sorted_at) + 0.5) / np.bincount(at)[sorted_at]
 
     # ---- a ray of light to that point in proportion to its light, and its colour over that of all
-    ray = _systematic(rays.light.mean(axis=2), at, u)
-    light, mean = rays.light.reshape(-1, rays.light.shape[2])[ray], rays.light.sum(axis=1)[at]
+    w, light = rays.some(_systematic(rays.brightness, at, u))
+    mean = rays.whole[at]
     colour = light * (mean.mean(axis=1) / np.maximum(light.mean(axis=1), 1e-30))[:, None] / np.maximum(mean, 1e-30)
     share = 1 / (n * probability.ravel()[number])
-    return LitPairs(row, number, share, rays.w.reshape(-1, 3)[ray], colour)
+    return LitPairs(row, number, share, w, colour)
 
 
 def _systematic(weights: np.ndarray, row: np.ndarray, u: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from benchmarks.modelling.meshes import Box, surface
 from benchmarks.random_shapes import box
 from full_geometry.geometry.light_points import SurfacePoints, uniform_entries
+from full_geometry.geometry.points import of_rows
 from full_geometry.geometry.shape import analyse_shape
 from full_geometry.integrators.fine_light import FineLight, fine_light
 from full_geometry.integrators.gathering import _steadied, _stratified
@@ -223,14 +224,17 @@ def test_rings_keep_uniform_light_as_it_is() -> None:
 def test_pairs_are_chosen_by_their_light_and_along_rays_that_bring_some() -> None:
     rng = np.random.default_rng(3)
     brought, point = rng.exponential(size=(64, 32)), rng.integers(0, 64, (64, 32))
-    rays = Rays(rng.normal(size=(64, 10, 3)), rng.exponential(size=(64, 10, 3)) * (np.arange(10) > 4)[:, None])
-    lit = lit_pairs(brought, point, rays)
+    w, light = rng.normal(size=(640, 3)), rng.exponential(size=(64, 10, 3)) * (np.arange(10) > 4)[:, None]
+    of_light = of_rows(mi.Spectrum, light.reshape(640, 3).astype(np.float32))
+    lit = lit_pairs(brought, point, Rays.of(of_rows(mi.Vector3f, w.astype(np.float32)), of_light, light.sum(axis=1)))
     n = len(lit.row) // 64
     share = 0.9 * brought / brought.sum(axis=1, keepdims=True) + 0.1 / 32
     assert np.abs(np.bincount(lit.number, minlength=brought.size) - n * share.ravel()).max() <= 1
     assert np.allclose(lit.share * n * share.ravel()[lit.number], 1)
-    whole = rays.light.sum(axis=1)[point.ravel()[lit.number]]
+    whole = light.sum(axis=1)[point.ravel()[lit.number]]
     assert np.allclose((lit.colour * whole).mean(axis=1), whole.mean(axis=1))  # 0 along rays without light
+    number = np.array([np.abs(w - each).sum(axis=1).argmin() for each in lit.w])
+    assert (number // 10 == point.ravel()[lit.number]).all() and (number % 10 > 4).all()
 
 
 def test_numbers_of_a_row_are_one_in_each_stratum() -> None:
