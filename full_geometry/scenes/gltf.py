@@ -177,12 +177,14 @@ class _File:
             turned = self._array(has.NORMAL) @ np.linalg.inv(linear)
             vertices.append(turned / np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-30))
             names += ["nx", "ny", "nz"]
-        if has.TEXCOORD_0 is not None:
-            vertices.append(self._array(has.TEXCOORD_0))
+        material = self._material(primitive.material)
+        if has.TEXCOORD_0 is not None or _is_textured(material):
+            # without uv a texture shows its value at 0; of itself Mitsuba would repeat it on each face
+            self.not_taken += [f"textures of {node.name}, which has no uv"] if has.TEXCOORD_0 is None else []
+            vertices.append(np.zeros((count, 2)) if has.TEXCOORD_0 is None else self._array(has.TEXCOORD_0))
             names += ["u", "v"]
         faces = np.arange(count) if primitive.indices is None else self._array(primitive.indices).astype(int)
         faces = faces.reshape(-1, 3)[:, :: 1 if np.linalg.det(linear) > 0 else -1]
-        material = self._material(primitive.material)
         lit_behind = material.doubleSided and any(material.emissiveFactor or ()) and _is_open(vertices[0][faces])
         bent = material.normalTexture is not None and has.TEXCOORD_0 is not None and _is_mirrored(vertices[-1][faces])
         self.not_taken += [f"light of {node.name} behind its faces"] if lit_behind else []
@@ -415,6 +417,13 @@ def _translucent(given: dict[str, Any], medium: Medium | None, base: dict[str, A
         index = float(materials.load(given["material"]).medium.eta if "material" in given else given["eta"])
         result["bsdf"] = {"type": "roughdielectric", "alpha": alpha, "int_ior": index, "ext_ior": 1.0}
     return result
+
+
+def _is_textured(material: pygltflib.Material) -> bool:
+    """Whether a material has a texture."""
+    pbr = material.pbrMetallicRoughness
+    parts = [vars(material), vars(pbr) if pbr else {}, *(material.extensions or {}).values()]
+    return any(name.endswith("Texture") and value is not None for part in parts for name, value in part.items())
 
 
 def _given(material: pygltflib.Material) -> dict[str, Any]:

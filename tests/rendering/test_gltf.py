@@ -240,6 +240,7 @@ HALF = gltf.PbrMetallicRoughness(baseColorFactor=[1.0, 1.0, 1.0, 0.5])
 NEAR = {"textures": [gltf.Texture(source=0, sampler=0)], "samplers": [gltf.Sampler(magFilter=9728, wrapS=33071)]}
 BARE = gltf.Primitive(attributes=gltf.Attributes(POSITION=0, NORMAL=1), indices=3)
 FACE = gltf.Primitive(attributes=gltf.Attributes(POSITION=0), indices=None, material=0)
+PLAIN = gltf.Primitive(attributes=gltf.Attributes(POSITION=0, NORMAL=1), indices=3, material=0)
 GLOW = {"emissiveFactor": [1.0, 0.5, 0.2], "doubleSided": True}
 TOLD = {  # changes: what is not taken
     "extension": ({"extensionsUsed": ["KHR_materials_variants"]}, "KHR_materials_variants"),
@@ -251,6 +252,8 @@ TOLD = {  # changes: what is not taken
     ),
     "back": ({"meshes": [gltf.Mesh(primitives=[FACE])], "look": GLOW}, "light of Ball.001 behind its faces"),
     "closed": ({"look": GLOW}, ""),
+    "uv": ({"meshes": [gltf.Mesh(primitives=[PLAIN])], "textured": True}, "textures of Ball.001, which has no uv"),
+    "no texture": ({"meshes": [gltf.Mesh(primitives=[PLAIN])]}, ""),
     "ior": ({"parts": {**_transmits(1.0, solid=VOLUME), "KHR_materials_specular": {"specularFactor": 0.5}}},
             "specularFactor (skin), roughness (skin), base color (skin)"),
 }  # fmt: skip
@@ -265,6 +268,10 @@ def test_what_changes_the_picture_and_is_not_taken_is_told(of: str, tmp_path: Pa
     assert [str(w.message).split("it: ")[1] for w in warned] == ([told] if told else [])
     if of == "wrap":
         assert scene["material skin"]["bsdf"]["base_color"]["filter_type"] == "nearest"
+    if of == "uv":
+        assert not np.array(
+            mi.traverse(mi.load_dict(scene["Ball_001"] | {"bsdf": {"type": "null"}}))["vertex_texcoords"]
+        ).any()
     if of == "object":  # a mesh without a material is white rough metal
         assert scene["material none"]["bsdf"]["metallic"] == scene["material none"]["bsdf"]["roughness"] == 1
 
