@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -92,8 +93,8 @@ def bench_renders(variant: str, size: int, training: float = 0.0, spp: int = SPP
 def bench_edits(variant: str, size: int) -> Iterator[Row]:
     """Seconds of the first look after the light has turned and after the camera has moved, one sample a pixel.
 
-    A row has a way, the seconds of the first image of a scene whose kernels are known, and of the next ones. It is what
-    `view` shows first, in all pixels: of walks, with little light inside, or with that of the last camera.
+    A row has a way, the seconds of the first image of a scene whose kernels are known, and of the next ones. Images are
+    those of `view` in all pixels: of walks, with little light inside, or with that of the last camera.
     """
     use_mitsuba(variant)
     import mitsuba as mi
@@ -141,9 +142,13 @@ def _unchanged(scene: object) -> None:
 
 def _timed(scene: object, change: Callable[[object], None]) -> float:
     """Wall seconds of a change and the first look after it."""
+    from full_geometry.integrators.bssrdf import is_bssrdf
+
     started = time.perf_counter()
     change(scene)
-    np.array(scene.integrator().preview(scene, scene.sensors()[0], 0, 1))
+    integrator = scene.integrator()
+    draw = integrator.preview if is_bssrdf(integrator) else partial(integrator.preview, glints=True)
+    np.array(draw(scene, scene.sensors()[0], 0, 1))
     return time.perf_counter() - started
 
 

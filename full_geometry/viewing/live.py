@@ -46,7 +46,7 @@ COARSE = 4  # one of so many pixels of each row and column comes first
 BRIEF = 0.15  # seconds; passes that take longer have no more samples, as edits wait for one
 SHARE = 4  # a pass has at most a quarter of the samples so far
 SAMPLES_OF_LIGHT = 2**20  # that light inside serves at most, as edits wait for it
-LIT = 2  # samples; at twice as many, walks find more light than a preview has, and glints
+LIT = 2  # samples; at twice as many, walks find more light than a preview has
 MOST = 4096  # samples of a pixel
 GUIDE_SPP = 4
 MAPS = (".exr", ".hdr")
@@ -229,7 +229,7 @@ class LiveScene:
                 if mean is not None and mean.spp >= lit + min(lit, most / pixels):
                     lit = mean.spp
                     integrator.prepare(self.scene, min(lit * pixels, most), number)
-                draw = partial(integrator.preview, glints=lit > LIT)
+                draw = partial(integrator.preview, glints=True)
             image = image_of(draw, self.scene, sensor, number, spp)
             last = time.perf_counter() - begun
             mean = (mean or Reference.empty(image.shape, {})).add(image, spp, last)
