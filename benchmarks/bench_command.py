@@ -91,7 +91,8 @@ def bench(
 ) -> None:
     """Measure speed: events a second, equal-error time over Mitsuba, models, maps, renders, edits, first images.
 
-    The default for a CPU is walk, volpath, models and maps; for a GPU, trace, renders, edits and first.
+    The default for a CPU is walk, volpath, models and maps; for a GPU, trace, renders, edits and first. Rows of an
+    interrupted run are written and printed.
     """
     from benchmarks.bench import machine, peak_memory
     from halfspace_sss.backend import array_types
@@ -105,7 +106,15 @@ def bench(
     if "models" in parts and find_spec("torch") is None:
         notes.append("the models are not measured in torch, which is not installed")
     array_types(backend)
-    measured = _measured(parts, backend, quick)
+    tables: dict[str, list[dict]] = {part: [] for part in parts}
+    interrupt = None
+    try:
+        _measure(tables, backend, quick)
+    except KeyboardInterrupt as error:
+        interrupt = error
+    measured = {part: rows for part, rows in tables.items() if rows}
+    if interrupt and not measured:
+        raise interrupt
 
     import pandas
 
@@ -125,22 +134,22 @@ def bench(
         shared.say(TITLES[part], shared.table([COLUMNS[key][0] for key in keys], cells))
     shared.say(*notes, *([] if memory is None else [f"peak memory {memory:.2f} GiB"]), "written:")
     shared.say_files(files)
+    if interrupt:
+        raise interrupt
 
 
-def _measured(parts: list[str], backend: str, quick: bool) -> dict[str, list[dict]]:
-    """Rows by part."""
-    tables: dict[str, list[dict]] = {part: [] for part in parts}
+def _measure(tables: dict[str, list[dict]], backend: str, quick: bool) -> None:
+    """Add the rows of each part to its table."""
     lengths = _lengths(quick)
-    total, done = sum(SECONDS[part] * lengths[part] for part in parts), 0
+    total, done = sum(SECONDS[part] * lengths[part] for part in tables), 0
     with shared.Bar("measuring") as bar:
-        for part in parts:
+        for part in tables:
             bar.show(done, total, part)
             for row in _rows(part, backend, quick, tables):
                 tables[part].append(row)
                 bar.show(done + SECONDS[part] * len(tables[part]), total, part)
             done += SECONDS[part] * lengths[part]  # a model may have refused the medium
             bar.show(done, total, part)
-    return tables
 
 
 def _lengths(quick: bool) -> dict[str, int]:

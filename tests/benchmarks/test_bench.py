@@ -86,6 +86,18 @@ def test_without_mitsuba_volpath_is_left_out_with_a_sentence(tmp_path: Path, mon
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bench.json", "bench_walk.csv"]
 
 
+def test_rows_of_an_interrupted_run_are_written(tmp_path: Path, monkeypatch: Any) -> None:
+    def rows(part: str, *_: Any) -> Any:
+        if part == "edits":
+            raise KeyboardInterrupt
+        yield {"albedo": 0.5, "events_per_s": 1e8}
+
+    monkeypatch.setattr(cli_bench, "_rows", rows)
+    result = _invoke("--only", "trace", "--only", "edits", "--out", str(tmp_path))
+    assert result.exit_code == 130 and "1.00e+08" in result.stdout
+    assert [path.name for path in sorted(tmp_path.iterdir())] == ["bench.json", "bench_trace.csv"]
+
+
 def test_a_gpu_has_parts_of_its_own_and_refuses_those_of_the_cpu() -> None:
     assert cli_bench.chosen_parts(None, "cuda") == list(cli_bench.OF_BACKEND["cuda"])
     with pytest.raises(ValueError, match="only must be one of trace, .* with --backend cuda, got 'maps'"):
