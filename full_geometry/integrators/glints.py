@@ -47,7 +47,7 @@ def glint_light(
     """Emission that samples of pixels with glints see in objects, each the mean over many places of its pixel.
     `samples`: the number of the first of each pixel, and how many."""
     (first, spp), number = samples, dr.width(glints.pixels)
-    each = int(dr.prod(sampled_size(sensor.film()))) // (SHARE * number)
+    each = PixelGrid.of(sensor).pixels // (SHARE * number)
     each = 2 ** (min(max(each, PLACES), MOST_PLACES).bit_length() - 2)
     pixel = dr.arange(mi.UInt32, number * spp * each) // dr.opaque(mi.UInt32, spp * each)
     low, high = (dr.gather(mi.Point2f, v, pixel) for v in glints[1:])
@@ -83,7 +83,7 @@ def glints_of(tracer: PathTracer, sensor: mi.Sensor, trial: int) -> Glints:
         light = mi.Spectrum(weight * tracer.seen_emission(places))
         dr.eval(light)
         if first and (dr.any(dr.max(light) > 0) or dr.any(near)):  # else no other light is asked for
-            least = GLINT * _other_light(tracer, sensor)
+            least = GLINT * _other_light(tracer, sensor, film)
         # Σ_c E[L_c²] - E[L_c]², by the pixels about each
         light = [mi.Float64(v) for v in light]
         moments = [*light, sum(v * v for v in light)]
@@ -205,10 +205,9 @@ def _near_mirrored(tracer: PathTracer, sensor: mi.Sensor, film: PixelGrid) -> mi
     return result
 
 
-def _other_light(tracer: PathTracer, sensor: mi.Sensor) -> float:
+def _other_light(tracer: PathTracer, sensor: mi.Sensor, film: PixelGrid) -> float:
     """The mean square of the light of objects without the emission seen in them."""
-    pixels = int(dr.prod(sampled_size(sensor.film())))
-    pixels = aligned(mi.UInt32, np.linspace(0, pixels - 1, LIT_RAYS).astype(np.uint32))
+    pixels = aligned(mi.UInt32, np.linspace(0, film.pixels - 1, LIT_RAYS).astype(np.uint32))
     rays, weight = _rays(tracer, sensor, path_numbers(seeded(0, 2), LIT_RAYS, 0, 1), pixels)
     apart = dr.opaque(mi.Bool, True, LIT_RAYS)
     L, hit, _ = replace(tracer, apart=apart).trace(rays, on_device(PATH_LANES), (0, 2))

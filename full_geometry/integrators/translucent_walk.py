@@ -217,13 +217,18 @@ def _class(variant: str) -> type:
             `glints`: whether many places of their pixels are asked for them, which a search has to find.
             """
             with interruptible(), undisturbed(), dr.suspend_grad():
-                state = light_state(scene)
-                if self._kept[0] != state:
-                    self._kept = state, self.tracer(scene, seed, 1, fewest=PREVIEW_RAYS).visitor.unscattered
-                tracer = self.tracer(scene, seed, 1, light=self._kept[1])
+                light = self._kept_light(scene)
+                tracer = self.tracer(scene, seed, 1, light=light, fewest=PREVIEW_RAYS)
+                if light is None:
+                    self._kept = light_state(scene), tracer.visitor.unscattered
                 found = self._glints_in(scene, tracer, sensor, spp) if glints else None
                 _render(tracer, sensor, seed, spp, None, False, found)
                 return sensor.film().develop()
+
+        def _kept_light(self, scene: mi.Scene) -> UnscatteredLight | None:
+            """The light inside that is kept; None once objects or emitters have changed."""
+            known, light = self._kept
+            return light if light is not None and known == light_state(scene) else None
 
         def _glints_in(self, scene: mi.Scene, tracer: PathTracer, sensor: mi.Sensor, spp: int) -> Glints | None:
             """`glints_of`, the same for all images of a view; None where that emission is met by chance.
@@ -248,9 +253,7 @@ def _class(variant: str) -> type:
         ) -> tuple:
             with undisturbed(), dr.suspend_grad():
                 seed = tuple(int(2**24 * sampler.next_1d()[0]) for _ in range(2))
-                known, light = self._kept
-                light = light if light is not None and known == light_state(scene) else None
-                tracer = self.tracer(scene, seed[0], sampler.wavefront_size(), light=light)
+                tracer = self.tracer(scene, seed[0], sampler.wavefront_size(), light=self._kept_light(scene))
                 rays = tracer.shown(widened(ray, sampler.wavefront_size()))
                 L, seen, emission = tracer.trace(rays, on_device(PATH_LANES), seed)
             layer = list(mi.Color3f(emission)) if self.layers else []
