@@ -8,7 +8,6 @@ import numpy as np
 
 from figures.computing.contenders import WALK
 from figures.computing.scans import scan_scene
-from figures.drawing import image_grid
 from figures.parts.part import SceneDict
 from halfspace_sss import bssrdf
 from halfspace_sss.physics.medium import Medium
@@ -89,4 +88,6 @@ def label(method: str) -> str:
     if method in VOLUMES:
         kind, rr_depth = method.split()
         return f"Mitsuba {kind}, roulette from {rr_depth}"
+    from figures.drawing import image_grid
+
     return image_grid.label(method)

@@ -13,10 +13,10 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import mitsuba as mi
 import numpy as np
-import pandas
 
 from benchmarks.hand_and_ribbon import SHAPES, STANDING
 from benchmarks.methods import ready, volume
@@ -35,6 +35,9 @@ from halfspace_sss import materials
 from halfspace_sss.neural.store import weights_in
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import provenance, write_atomically
+
+if TYPE_CHECKING:
+    import pandas
 
 LIGHTS = ("windows", "lamp and sky")
 ALL_LIGHTS = (*LIGHTS, "even sky", "small light", "sun and sky")
@@ -236,6 +239,8 @@ def speeds(
         folder: for weights, meshes and rows.
         progress: called with what, done and all.
     """
+    import pandas
+
     prepare()
     rows = []
     for k, case in enumerate(cases):

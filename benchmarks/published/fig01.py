@@ -15,7 +15,6 @@ from figures.computing.contenders import COMPILING, NOTE, OF_OBJECTS, against, r
 from figures.computing.images import Shot
 from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, training_of, weight_files, with_weights
 from figures.computing.scans import environment, environment_file, prepare
-from figures.drawing.image_grid import image_files, label, rows_of
 from figures.parts.part import Part, Result, SceneDict, Task
 
 TITLE = "candle with its flame, mandarin and croissant, path traced and by models, light gathered and corrected"
@@ -129,12 +128,16 @@ def foot(part: SceneDict) -> float:
 
 def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
     """The figure as PDF and PNG, the page to flip between the images, and the numbers as a table."""
+    from figures.drawing.image_grid import image_files, rows_of
+
     scenes = {name: _shots(results, name) for name in dict.fromkeys(key.split(", ")[0] for key in results)}
     return image_files("fig01", "Fig. 1: candle, mandarin and croissant", scenes, rows_of(scenes, "object"), NOTES)
 
 
 def _shots(results: Mapping[str, Result], name: str) -> list[Shot]:
     """The images of an object, exposed alike."""
+    from figures.drawing.image_grid import label
+
     reference = reference_shot(results[f"{name}, {TRUTH}"])
     return [
         reference[0],
