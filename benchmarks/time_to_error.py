@@ -107,7 +107,7 @@ def _errors(found: Reference, denoise: Denoise) -> dict[str, float]:
         raw = variance.sum() if size == 1 else 0.25 * np.square(means.A - means.B).sum()
         # sum L², an estimate, falls to 0 and below where noise hides the image
         whole = np.square(_means(mean, size)).sum() - raw
-        for key, square in ((name, max(squared.sum(), noise)), (f"raw {name}", raw)):
+        for key, square in ((name, max(squared.sum(), noise.sum())), (f"raw {name}", raw)):
             result[key] = float(np.sqrt(square / whole)) if whole > 0 else np.inf
     return result
 

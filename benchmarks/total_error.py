@@ -5,17 +5,17 @@ The error of an image X over a reference R is
     sqrt(sum (X - R)² / sum R²)
 
 over all pixels of the object and channels, of pixels and of means over blocks of 8 x 8. R is a long image by walks
-whose light is sampled, which has no bias; its variance is taken off. Ways are path tracing by Mitsuba's `volpathmis` at
-two roulette depths, walks with sampled and with precomputed light, and light that is gathered by a model and corrected
-by walks, each as rendered and denoised by Open Image Denoise.
-Beside it stand what the object is in the mean over R, and the variance of a sample times its CPU seconds, summed over
-the pixels, over that of `volpathmis` at its better depth.
+whose light is sampled, which has no bias, or precomputed, which has less noise; its variance is taken off. Ways are
+path tracing by Mitsuba's `volpathmis` at two roulette depths, walks with sampled and with precomputed light, and light
+that is gathered by a model and corrected by walks, each as rendered and denoised by Open Image Denoise.
+Beside it stand the error over these pixels that a render tells without R, means over R, and the variance of a sample
+times its CPU seconds, summed over the pixels, over that of `volpathmis` at its better depth.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -28,8 +28,9 @@ from benchmarks.methods import ready
 from benchmarks.speeds import VOLUMES, LitObject
 from figures.computing.scans import prepare
 from figures.parts.part import Row
-from full_geometry.scenes.reference import cross_denoised
-from full_geometry.scenes.reference_store import Reference
+from full_geometry.geometry.sensors import sampled_size
+from full_geometry.scenes.reference import Denoise, MixedHalves, cross_denoised
+from full_geometry.scenes.reference_store import LIGHT, Reference
 from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
 from full_geometry.trade.denoising import Denoiser, cover
 
@@ -37,9 +38,10 @@ SAMPLED, PRECOMPUTED = "walk, light sampled", "walk, light precomputed"
 MODEL, CORRECTED = "better_dipole", "better_dipole, light corrected"
 REFERENCE = "reference"
 PASSING = (*VOLUMES, SAMPLED, PRECOMPUTED)  # whose passes are independent
+WAYS = (*PASSING, CORRECTED)
 BLOCK = 8  # pixels of its side
 REFERENCE_SPP = 64  # of a pass of the reference
-LEAST_SPP, MOST_SPP = 1, 1024  # of a pass
+LEAST_SPP, MOST_SPP = 1, 1024  # of a pass; of corrected light half of an image
 SHARE = 4  # passes in the shortest time: their spread tells the variance
 
 
@@ -52,12 +54,16 @@ class TotalErrors:
         reference: CPU seconds of the reference.
         size: pixels of the square images.
         seed: of all renders.
+        ways: of `WAYS`.
+        truth: SAMPLED or PRECOMPUTED, the way of the reference.
     """
 
     seconds: tuple[float, ...] = (5.0, 20.0, 80.0)
     reference: float = 600.0
     size: int = 128
     seed: int = 0
+    ways: tuple[str, ...] = WAYS
+    truth: str = SAMPLED
 
 
 class Measured(NamedTuple):
@@ -74,8 +80,8 @@ class Measured(NamedTuple):
 
 def total_errors(
     cases: Sequence[LitObject], how: TotalErrors, folder: Path, progress: Callable[[str, int, int], None]
-) -> Measured:
-    """Errors of all cases, ways and times."""
+) -> Iterator[Measured]:
+    """Errors of all ways and times, of ever more cases."""
     prepare()
     folder.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
@@ -84,7 +90,7 @@ def total_errors(
         progress(f"{case.name}, {case.light}", k, len(cases))
         found, seen = _measured(case, how, folder)
         rows, images = rows + found, images or seen
-    return Measured(pandas.DataFrame(rows), images)
+        yield Measured(pandas.DataFrame(rows), images)
 
 
 def lit_scene(case: LitObject, way: str, size: int, folder: Path) -> mi.Scene | tuple[mi.Scene, ...]:
@@ -99,10 +105,10 @@ def lit_scene(case: LitObject, way: str, size: int, folder: Path) -> mi.Scene | 
 
 
 def _measured(case: LitObject, how: TotalErrors, folder: Path) -> tuple[list[Row], dict[str, np.ndarray]]:
-    scenes = {way: lit_scene(case, way, how.size, folder) for way in PASSING}
-    inside = cover(scenes[SAMPLED]) > 0
-    denoise = Denoiser(scenes[SAMPLED])
-    reference = _passes(scenes[SAMPLED], how.reference, REFERENCE_SPP, how.seed + 1)[0][..., :3]
+    scenes = {way: lit_scene(case, way, how.size, folder) for way in PASSING if way in how.ways}
+    truth = lit_scene(case, how.truth, how.size, folder)
+    inside, denoise = cover(truth) > 0, Denoiser(truth)
+    reference = _passes(truth, how.reference, REFERENCE_SPP, how.seed + 1)[0][..., :3]
     R, noise = reference.mean(axis=0), reference.var(axis=0, ddof=1) / len(reference)
 
     # ---- images of every way after each time: means of passes, and corrected light from its beginning
@@ -115,16 +121,15 @@ def _measured(case: LitObject, how: TotalErrors, folder: Path) -> tuple[list[Row
             n = int(np.clip(np.searchsorted(np.cumsum(seconds), limit, side="right"), 1, len(seconds)))
             found[way, limit] = _averaged(images[:n], spp)
         costs[way] = _cost(images[..., :3], seconds, inside)
-    for limit in how.seconds:
+    for limit in how.seconds if CORRECTED in how.ways else ():
         found[CORRECTED, limit] = _corrected(lambda: lit_scene(case, CORRECTED, how.size, folder), limit, how.seed)
-    best = min(costs[way] for way in VOLUMES)
+    best = min((costs[way] for way in VOLUMES if way in costs), default=np.nan)
 
     # ---- a row for each, raw and denoised
     rows, images, middle = [], {REFERENCE: R}, how.seconds[len(how.seconds) // 2]
     for (way, limit), average in found.items():
-        clean = cross_denoised(average, denoise)
-        raw = average.mean[..., :3], average.relative_error
-        for name, (result, told) in (("raw", raw), ("denoised", (clean.image, clean.error))):
+        results = average.mean[..., :3], cross_denoised(average, denoise).image
+        for name, result, told in zip(("raw", "denoised"), results, _told(average, denoise, inside)):
             pixels, blocks = (_error(result, R, noise, inside, size) for size in (1, BLOCK))
             if limit == middle:
                 images[f"{way}, {name}"] = result
@@ -140,25 +145,36 @@ def _measured(case: LitObject, how: TotalErrors, folder: Path) -> tuple[list[Row
     return rows, images
 
 
-def _averaged(images: np.ndarray, spp: int) -> Reference:
-    """The mean of passes, with that of half of them."""
-    result = Reference.empty(images.shape[1:], {}, halves=True)
+def _told(found: Reference, denoise: Denoise, inside: np.ndarray) -> tuple[float, float]:
+    """What the halves and the light tell of the error over the pixels of the object, raw and denoised."""
+    if found.passes < 2:
+        return np.inf, np.inf
+    variance = found.variance[inside, :3].sum()
+    squared, noise = (x[inside].sum() for x in MixedHalves.of(found, denoise).squared())
+    whole = max(np.square(found.mean[inside, :3]).sum() - variance, 1e-30)
+    return tuple(float(np.hypot(np.sqrt(v / whole), found.light_error)) for v in (variance, max(squared, noise)))
+
+
+def _averaged(images: np.ndarray, spp: int, light: float = 0.0) -> Reference:
+    """The mean of passes, with that of half of them, and the error of the light that they share."""
+    result = Reference.empty(images.shape[1:], {LIGHT: {"error": light}}, halves=True)
     for image in images:
         result = result.add(image, spp, 0.0)
     return result
 
 
 def _corrected(fresh: Callable[[], mi.Scene], limit: float, seed: int) -> Reference:
-    """The image of most samples, a power of two, whose light and pixels take so many CPU seconds from a fresh scene."""
+    """Two passes of most samples, a power of two, whose light and pixels take so many CPU seconds from fresh scenes."""
     spp, best = LEAST_SPP, None
     mi.render(fresh(), spp=1, seed=seed)  # compiles
     while spp <= MOST_SPP:
         scene, started = fresh(), time.process_time()
-        image = np.array(mi.render(scene, spp=spp, seed=seed), dtype=np.float64)
+        scene.integrator().prepare(scene, 2 * spp * int(np.prod(sampled_size(scene.sensors()[0].film()))))
+        images = np.array([image_of_pass(scene, spp, seed + k) for k in range(2)], dtype=np.float64)
         if time.process_time() - started > limit and best is not None:
             break
-        best, spp = (image, spp), 2 * spp
-    return _averaged(best[0][None], best[1])
+        best, spp = _averaged(images, spp, scene.integrator().corrections.error or 0.0), 2 * spp
+    return best
 
 
 def _samples(scene: mi.Scene | tuple[mi.Scene, ...], seconds: float, seed: int) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -54,11 +54,13 @@ def total_error_command(
     reference: Annotated[float, typer.Option(help="CPU seconds of the reference.")] = 600.0,
     size: Size = 128,
     seed: RenderSeed = 0,
+    way: Annotated[list[str] | None, typer.Option(help="A way; repeat for more.", show_default="all")] = None,
+    truth: Annotated[Literal["sampled", "precomputed"], typer.Option(help="Light of the reference.")] = "sampled",
     out: OutFolder = Path("total_error"),
 ) -> None:
     """Measure total error over seconds of path tracing, raw and denoised, over long walks: all orders."""
     use_mitsuba("llvm_ad_rgb")
-    from benchmarks.total_error import TotalErrors, total_errors
+    from benchmarks.total_error import PRECOMPUTED, SAMPLED, WAYS, TotalErrors, total_errors
     from benchmarks.total_error_plot import draw
     from halfspace_sss.comparison.style import saved
 
@@ -67,18 +69,17 @@ def total_error_command(
         check_interval("seconds", value, 0.1, 1e6)
     check_count("size", size, 16)
     check_count("seed", seed, 0)
+    for name in way or ():
+        check_choice("way", name, WAYS)
     check_folder(out)
     with Bar("total error") as bar:
-        how = TotalErrors(times, reference, size, seed)
-        measured = total_errors(cases, how, out / "work", lambda what, k, n: bar.show(k, n, what))
-    table = measured.table
-    text = markdown(table.round(3))
-    csv = table.to_csv(index=False, lineterminator="\n")
+        ways, light = tuple(way or WAYS), {"sampled": SAMPLED, "precomputed": PRECOMPUTED}[truth]
+        how = TotalErrors(times, reference, size, seed, ways, light)
+        for measured in total_errors(cases, how, out / "work", lambda what, k, n: bar.show(k, n, what)):
+            text, csv = markdown(measured.table.round(3)), measured.table.to_csv(index=False, lineterminator="\n")
+            write_together({out / "total_error.csv": csv, out / "total_error.md": text})
     drawn = saved(draw(measured))
-    write_together(
-        {out / "total_error.csv": csv, out / "total_error.md": text, out / "total_error.pdf": drawn["pdf"],
-         out / "total_error.png": drawn["png"]}
-    )  # fmt: skip
+    write_together({out / "total_error.pdf": drawn["pdf"], out / "total_error.png": drawn["png"]})
     console().print(text, highlight=False, markup=False, soft_wrap=True)
 
 

@@ -32,6 +32,7 @@ def draw(measured: Measured) -> Figure:
         measured: by `total_error.total_errors`; of `volpathmis` the roulette depth with the smaller error is shown.
     """
     table = measured.table
+    curves = {key: value for key, value in CURVES.items() if table["way"].str.startswith(key).any()}
     cases = list(table.groupby(["object", "light"], sort=False))
     with paper():
         figure = Figure(figsize=(max(2.3 * len(cases), 4.6), 5.6), layout="constrained")
@@ -41,7 +42,7 @@ def draw(measured: Measured) -> Figure:
         for column, ((name, light), rows) in enumerate(cases):
             for row, what in enumerate(("pixels, %", "blocks, %")):
                 ax = axes[row][column]
-                for technique, (label, colour) in CURVES.items():
+                for technique, (label, colour) in curves.items():
                     for kind, style in (("raw", "-"), ("denoised", "--")):
                         curve = _curve(rows, technique, kind, what)
                         shown = f"{label}, {kind}" if column == row == 0 else None
@@ -68,7 +69,8 @@ def _draw_renders(figure: SubFigure, measured: Measured) -> None:
     inside = reference.sum(axis=2) > 0
     stops = stops_of(reference, inside)
     box = tuple(slice(int(at.min()), int(at.max()) + 1) for at in np.nonzero(inside))
-    for ax, (technique, label) in zip(figure.subplots(1, 4), RENDERS):
+    shown = [each for each in RENDERS if any(way.startswith(each[0]) for way in measured.images)]
+    for ax, (technique, label) in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown):
         way = rows[rows.index.str.startswith(technique)].idxmin() if technique != REFERENCE else technique
         ax.imshow(srgb(np.maximum(measured.images[way][box], 0), stops), interpolation="nearest")
         error = f"\n{way.rpartition(', ')[2]}, {middle:g} s: {rows[way]:.1f} %" if way in rows.index else "\n"

@@ -109,13 +109,13 @@ class MixedHalves(NamedTuple):
         P, Q, N = (s * x + (s_coarse - s) * low for x, low in zip((to_B, to_A, noise), coarse))
         return cls(D_A + P, D_B + Q, N, A, B)
 
-    def squared(self) -> tuple[np.ndarray, float]:
-        """Estimates of e² of the pixels, (H, W, 3), and the part of their sum that is noise, not bias."""
+    def squared(self) -> tuple[np.ndarray, np.ndarray]:
+        """Estimates of e² of the pixels, (H, W, 3), whose sums have less noise, and their part that is noise."""
         P, Q, N, A, B = self
         apart = (P - Q) ** 2
         result = 0.5 * ((P - B) ** 2 + (Q - A) ** 2 + N**2 - (A - B - N) ** 2) - 0.25 * apart
         # P - Q + N is of the denoised halves alone
-        return result, float(0.25 * (np.square(P - Q + N) + N**2).sum())
+        return result, 0.25 * (np.square(P - Q + N) + N**2)
 
 
 def _share(A: np.ndarray, B: np.ndarray, noise: np.ndarray) -> float:
@@ -138,7 +138,7 @@ def cross_denoised(found: Reference, denoise: Denoise) -> Denoised:
     squared, noise = mixed.squared()
     squared = squared.sum(axis=2).ravel()
     whole = max(float(np.square(found.mean[..., :3]).sum() - found.variance[..., :3].sum()), 1e-30)
-    error = math.sqrt(max(float(squared.sum()), noise) / whole)
+    error = math.sqrt(max(float(squared.sum()), float(noise.sum())) / whole)
     spread = math.sqrt(squared.size) * float(squared.std()) / whole
     return Denoised(0.5 * (mixed.P + mixed.Q), error, spread / (2 * max(error, math.sqrt(spread), 1e-15)))
 

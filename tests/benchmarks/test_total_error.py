@@ -75,7 +75,7 @@ def test_precomputed_light_comes_nearer_to_the_reference_in_more_time(
 
     monkeypatch.setattr(module, "_corrected", once)
     case = LitObject("hand of potato", "windows")
-    table, images = module.total_errors([case], how, tmp_path, lambda *about: None)
+    ((table, images),) = module.total_errors([case], how, tmp_path, lambda *about: None)
     assert len(images) == 2 * len(module.PASSING) + 3
     found, corrected = (
         table[table["way"] == f"{way}, raw"] for way in ("walk, light precomputed", "better_dipole, light corrected")
