@@ -65,9 +65,10 @@ def bench_renders(variant: str, size: int, training: float = 0.0, spp: int = SPP
 
             with weights_in(folder):
                 for way in ways:
-                    n = min(spp, LEARNT_SPP) if way == LEARNT else spp
+                    n, scene = min(spp, LEARNT_SPP) if way == LEARNT else spp, None
+                    gc.collect()  # numbers of objects are in kernels: with no scene left both of the next have the same
                     image_of_pass(fresh(way), n, 1)  # compiles
-                    gc.collect()  # the numbers of its objects are in kernels: those of the next are then the same
+                    gc.collect()
                     scene, images, took = fresh(way), [], []
                     for k in range(PASSES + 1):
                         started = clock()
