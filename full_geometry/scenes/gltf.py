@@ -139,7 +139,9 @@ class _File:
             self._put(node.name, self._camera(node, place))
         if "KHR_lights_punctual" in parts:
             light = self.doc.extensions["KHR_lights_punctual"]["lights"][parts["KHR_lights_punctual"]["light"]]
-            self.not_taken += [f"range of {node.name}"] if "range" in light else []
+            inner, outer = _cone(light)
+            told = {"range": "range" in light, "falloff between the angles": light["type"] == "spot" and inner < outer}
+            self.not_taken += [f"{what} of {node.name}" for what, there in told.items() if there]
             self._put(node.name, _light(light, place))
         for primitive in self.doc.meshes[node.mesh].primitives if node.mesh is not None else ():
             triangles = primitive.mode in (None, TRIANGLES)
@@ -483,16 +485,23 @@ def _local(node: pygltflib.Node) -> np.ndarray:
 
 def _light(light: dict[str, Any], place: np.ndarray) -> dict[str, Any]:
     """A light in W/sr, or a sun in W/m²."""
-    sun, spot = light["type"] == "directional", light.get("spot", {})
+    sun = light["type"] == "directional"
     power = light.get("intensity", 1.0) / (1.0 if sun else LUMENS_PER_WATT)
     strength = {"type": "rgb", "value": [power * c for c in light.get("color", (1.0, 1.0, 1.0))]}
     if sun:
         return {"type": "directional", "direction": (-place[:3, 2]).tolist(), "irradiance": strength}
     if light["type"] == "point":
         return {"type": "point", "position": place[:3, 3].tolist(), "intensity": strength}
-    outer, inner = spot.get("outerConeAngle", math.pi / 4), spot.get("innerConeAngle", 0.0)
-    angles = {"cutoff_angle": math.degrees(outer), "beam_width": math.degrees(inner)}
-    return {"type": "spot", "to_world": _turned(place), "intensity": strength, **angles}
+    inner, outer = map(math.degrees, _cone(light))  # between them glTF has a square of cosines, Mitsuba the angle
+    return {
+        "type": "spot", "to_world": _turned(place), "intensity": strength, "cutoff_angle": outer, "beam_width": inner,
+    }  # fmt: skip
+
+
+def _cone(light: dict[str, Any]) -> tuple[float, float]:
+    """The inner and the outer angle of a spot."""
+    spot = light.get("spot", {})
+    return spot.get("innerConeAngle", 0.0), spot.get("outerConeAngle", math.pi / 4)
 
 
 def _turned(place: np.ndarray) -> mi.ScalarTransform4f:

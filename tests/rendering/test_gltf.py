@@ -242,9 +242,13 @@ BARE = gltf.Primitive(attributes=gltf.Attributes(POSITION=0, NORMAL=1), indices=
 FACE = gltf.Primitive(attributes=gltf.Attributes(POSITION=0), indices=None, material=0)
 PLAIN = gltf.Primitive(attributes=gltf.Attributes(POSITION=0, NORMAL=1), indices=3, material=0)
 GLOW = {"emissiveFactor": [1.0, 0.5, 0.2], "doubleSided": True}
+EVEN = {"spot": {"innerConeAngle": 0.5, "outerConeAngle": 0.5}}
 TOLD = {  # changes: what is not taken
     "extension": ({"extensionsUsed": ["KHR_materials_variants"]}, "KHR_materials_variants"),
     "range": ({"extensions": {"KHR_lights_punctual": {"lights": [{"type": "point", "range": 2.0}]}}}, "range of Light"),
+    "spot": ({"extensions": {"KHR_lights_punctual": {"lights": [{"type": "spot", "spot": {"innerConeAngle": 0.5}}]}}},
+             "falloff between the angles of Light"),
+    "even spot": ({"extensions": {"KHR_lights_punctual": {"lights": [{"type": "spot", **EVEN}]}}}, ""),
     "wrap": ({**NEAR, "textured": True}, "wrapT of sampler 0"),
     "object": (
         {"meshes": [gltf.Mesh(primitives=[BARE], extras={"sss_mfp": 1.0})]},
