@@ -14,7 +14,7 @@ from full_geometry.settings import VARIANTS, Choices, Settings, variant_channels
 from full_geometry.surface.sheets import sheet_class
 from full_geometry.surface.translucent import translucent_class
 from full_geometry.transport.models import check_model, model_names
-from halfspace_sss.backend import prepare_llvm, two_threads
+from halfspace_sss.backend import gather_at_once, prepare_llvm, two_threads
 
 TRADE = "full_geometry.trade.automatic"
 _active = False
@@ -58,6 +58,7 @@ def _choose(scene: mi.Scene, settings: Settings) -> Choices:
 def _register_all() -> None:
     if mi.variant().startswith("llvm"):
         prepare_llvm()
+        gather_at_once()
     two_threads()
 
     def check(model: str) -> None:

@@ -150,3 +150,25 @@ def test_kernels_are_kept_where_the_environment_says(tmp_path: Path) -> None:
     env = {**os.environ, "DRJIT_CACHE_DIR": str(tmp_path)}
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, env=env, timeout=60)
     assert list(tmp_path.glob("*.bin"))
+
+
+def _flags() -> set[str]:
+    """What the CPU says that it has, on Linux."""
+    path = Path("/proc/cpuinfo")
+    lines = path.read_text(encoding="ascii").splitlines() if path.exists() else []
+    return {flag for line in lines if line.startswith("flags") for flag in line.split(":")[1].split()}
+
+
+@pytest.mark.skipif("avx2" not in _flags() or "avx512f" in _flags(), reason="not a CPU with AVX2 alone")
+@pytest.mark.parametrize("use", [REGISTER, "from halfspace_sss.backend import array_types\narray_types()"])
+def test_lanes_gather_at_once_and_those_that_are_masked_read_nothing(use: str) -> None:
+    code = (
+        f"import halfspace_sss\n{use}\nimport drjit as dr\nfrom drjit.llvm import Float, UInt32\n"
+        "values, place = dr.arange(Float, 10), dr.opaque(UInt32, 0, 9) + dr.arange(UInt32, 9)\n"
+        "dr.set_flag(dr.JitFlag.PrintIR, True)\n"
+        "found = dr.gather(Float, values, dr.select(place == 3, 2**30, place + 1), place != 3)\n"
+        "print([int(x) for x in found])"
+    )
+    found = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, timeout=60)
+    assert "+fast-gather" in found.stdout + found.stderr
+    assert found.stdout.strip().splitlines()[-1] == "[1, 2, 3, 0, 5, 6, 7, 8, 9]"
