@@ -53,6 +53,7 @@ from halfspace_sss.tracing.walk import generator, pass_seed
 ALONG = 3  # events that are looked up along a flight, a multiple of the channels
 MIRRORS = 2  # of objects, one in the other, in which the first surface of a path finds emission
 LEAST_SEEN = 1e-3  # transmittance, below which emission behind an object is left to chance
+REFLECTIONS, LEAST_REFLECTED = 6, 0.01  # inside an object, of what is seen through it; throughput that is followed
 
 # ---- Loop state ------------------------------------------------------------------------------------------------------
 
@@ -78,6 +79,7 @@ class LightRecord:
     slopes: Score | tuple[()] = ()  # where derivatives are asked for, see `walk.scores`
     run: ForwardRun | tuple[()] = ()  # where precomputed light has met forward events
     shallow: mi.Bool | tuple[()] = ()  # one event at most since the path went in, where deep light is told apart
+    exits: mi.UInt32 | tuple[()] = ()  # boundaries that a path without events meets, behind which emission is known
 
     def onward(self, passed: mi.Bool) -> LightRecord:
         """The record at a surface; `passed`: whether it is one of those that precomputed light comes by."""
@@ -92,6 +94,30 @@ class Seen(NamedTuple):
     light: mi.Spectrum
     found: mi.Bool
     kept: mi.Spectrum
+
+
+class SeenThrough(NamedTuple):
+    """Emission that is found without chance behind an object, on the way of a path without events.
+    `light`: with the throughput. `exits`: boundaries on that way, behind which it is found. `kept`: probability that a
+    first flight does not leave; 1 where it may meet surfaces there."""
+
+    light: mi.Spectrum
+    exits: mi.UInt32
+    kept: mi.Spectrum
+
+
+@dataclass
+class WayThrough:
+    """Loop variables of a way inside an object without events: where its segment begins, from there to where its ray
+    does, the direction, the throughput, whether it goes on, the boundaries that it has met, and light so far."""
+
+    o: mi.Point3f
+    off: mi.Vector3f
+    d: mi.Vector3f
+    throughput: mi.Spectrum
+    going: mi.Bool
+    exits: mi.UInt32
+    light: mi.Spectrum
 
 
 @dataclass
@@ -380,8 +406,11 @@ class LightVisitor:
         # ---- the last vertex is the boundary, with the density of the direction that leaves it
         before = record
         record = replace(record, previous=crossing.si.p, pdf=crossing.pdf, delta=crossing.delta)
-        if self.unscattered is not None:  # `emitter_behind` knows no reflections
+        if self.unscattered is not None:
             brings = crossing.brings(self.media, walk.d) & (walk.order > 0)
+            if self.sees_through:  # `emitter_behind` knows so many reflections
+                exits = dr.maximum(record.exits, 1) - 1
+                record, brings = replace(record, exits=exits), brings | ((walk.order == 0) & (exits > 0))
             record = replace(record, precomputed=record.precomputed & (crossing.leaves | brings))
         if self.forward:
             record = replace(record, run=record.run.onward(crossing.along))
@@ -447,16 +476,16 @@ class LightVisitor:
 
     def seen_emitters(
         self, walk: Walk, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32, active: mi.Bool
-    ) -> tuple[Seen, Seen]:
+    ) -> tuple[Seen, SeenThrough]:
         """What object k mirrors, and what is seen through it; added whatever is chosen, it must not count again.
         Only where light inside or leaving is known: beside light that is met by chance, of an even sky above all, the
         choice between both sides of the boundary has less noise. `active`: whether emitters are looked for; where a
         path has scattered, cones of delta lights are met instead."""
-        none = Seen(mi.Spectrum(0), mi.Bool(False), mi.Spectrum(1))
+        unseen = SeenThrough(mi.Spectrum(0), mi.UInt32(0), mi.Spectrum(1))
         if self.unscattered is None and self.outgoing is None:
-            return none, none
+            return Seen(mi.Spectrum(0), mi.Bool(False), mi.Spectrum(1)), unseen
         smooth = ~self.media.row("rough", k)
-        behind = self.emitter_behind(walk, si, k, smooth & active) if self.sees_through else none
+        behind = self.emitter_behind(walk, si, k, smooth & active) if self.sees_through else unseen
         return self.mirrored_emitter(walk, si, bsdf, k, smooth & active), behind
 
     def mirrored_emitter(
@@ -472,36 +501,68 @@ class LightVisitor:
         F = mi.Spectrum(self.media.reflected(k, si)) if self.media.tinted else value
         return Seen(walk.weight * value * L_e, active, dr.select(nothing, 1 - F, 1))
 
-    def emitter_behind(self, walk: Walk, si: mi.SurfaceInteraction3f, k: mi.Int32, active: mi.Bool) -> Seen:
-        """What is seen through object k without reflection inside, which no free flight then meets.
-        The light is (1 - F) T (1 - F') L_e, F of the boundary and F' of that on the other side, and what flights keep 1
-        - T (1 - F')."""
-        # ---- the refracted direction with 1 - F, and the boundary on its way
-        media, ctx = self.media, mi.BSDFContext()
+    def emitter_behind(self, walk: Walk, si: mi.SurfaceInteraction3f, k: mi.Int32, active: mi.Bool) -> SeenThrough:
+        """What is seen through object k without an event inside, which no free flight then meets.
+        The light is (1 - F) Σ_j T_j F_1 ... F_{j-1} (1 - F_j) L_e, F of the boundary, F_j of the j-th on the way inside
+        and T_j the transmittance up to it; of first flights 1 - T_1 (1 - F_1) are kept."""
+        # ---- the refracted direction with 1 - F, and what is seen at the first boundary on its way
+        ctx = mi.BSDFContext()
         ctx.type_mask = mi.BSDFFlags.DeltaTransmission
-        bs, value = media.boundary(k).sample(ctx, si, 0.0, mi.Point2f(0), active)
+        bs, value = self.media.boundary(k).sample(ctx, si, 0.0, mi.Point2f(0), active)
         d, _ = sided(si, bs.wo)
         active = active & (bs.pdf > 0) & (dr.dot(d, si.n) < 0)
-        o, off = media.depart(si, d, mi.Bool(True))
-        ray = mi.Ray3f(o + off, d)  # as far as light is left: at its edges a thick object is thin
-        ray.maxt = -math.log(LEAST_SEEN) / dr.min(media.spectrum("sigma_t", k)) - dr.dot(off, d)
-        hit = media.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
-        out = media.instance_scene.interaction(hit, ray, media.needed)
-        active = active & hit.is_valid() & (media.met(out, k) == k)
-        out = media.seen(out, k, d)
-        active = active & (dr.dot(out.n, d) > 0)
+        start = WayThrough(
+            *self.media.depart(si, d, mi.Bool(True)),
+            d,
+            walk.weight * value,
+            active,
+            dr.zeros(mi.UInt32, dr.width(d)),
+            mi.Spectrum(0),
+        )
+        way, passed, nothing = self._seen_at_boundary(start, k, walk.rng)
 
-        # ---- T (1 - F') at that boundary, and L_e of what is met beyond
-        T = media.transmittance(k, ray, dr.maximum(hit.t + dr.dot(off, d), 0), walk.rng)
-        active = active & (dr.max(T) > LEAST_SEEN)
-        bs, leaves = media.boundary(k).sample(ctx, out, 0.0, mi.Point2f(0), active)
+        # ---- what is seen at those after reflections inside, as far as there is light
+        least = opaque(LEAST_REFLECTED) * dr.max(walk.weight * value)
+
+        def on(way: WayThrough) -> mi.Bool:
+            return way.going & (way.exits <= REFLECTIONS) & (dr.max(way.throughput) > least)
+
+        way = dr.while_loop((way,), on, lambda way: (self._seen_at_boundary(way, k, walk.rng)[0],), label="behind")[0]
+        return SeenThrough(way.light, way.exits, dr.select(nothing, 1 - passed, 1))
+
+    def _seen_at_boundary(self, way: WayThrough, k: mi.Int32, rng: mi.PCG32) -> tuple[WayThrough, mi.Spectrum, mi.Bool]:
+        """The way through object k behind the next boundary, T (1 - F') there, and whether nothing is met beyond."""
+        # ---- the boundary, no farther than there is light left: at its edges a thick object is thin
+        media, ctx = self.media, mi.BSDFContext()
+        ray = mi.Ray3f(way.o + way.off, way.d)
+        ray.maxt = -math.log(LEAST_SEEN) / dr.min(media.spectrum("sigma_t", k)) - dr.dot(way.off, way.d)
+        hit = media.scene.ray_intersect_preliminary(ray, coherent=False, active=way.going)
+        out = media.instance_scene.interaction(hit, ray, media.needed)
+        going = way.going & hit.is_valid() & (media.met(out, k) == k)
+        out = media.seen(out, k, way.d)
+        going = going & (dr.dot(out.n, way.d) > 0)
+        T = media.transmittance(k, ray, dr.maximum(hit.t + dr.dot(way.off, way.d), 0), rng)
+        going = going & (dr.max(T) > LEAST_SEEN)
+
+        # ---- light += throughput T (1 - F') L_e of what is met beyond
+        ctx.type_mask = mi.BSDFFlags.DeltaTransmission
+        bs, leaves = media.boundary(k).sample(ctx, out, 0.0, mi.Point2f(0), going)
         d, _ = sided(out, bs.wo)
-        leaving = active & (bs.pdf > 0) & (dr.dot(d, out.n) > 0)
+        leaving = going & (bs.pdf > 0) & (dr.dot(d, out.n) > 0)
         L_e, nothing = self._emission_along(out, d, leaving)
-        let_out = mi.Spectrum(1 - self.media.reflected(k, out)) if self.media.tinted else leaves * dr.square(bs.eta)
-        passed = dr.select(leaving, T * let_out, 0)
-        light = dr.select(leaving, walk.weight * value * T * leaves * L_e, 0)
-        return Seen(light, active, dr.select(nothing, 1 - passed, 1))
+        F = media.reflected(k, out)
+        let_out = mi.Spectrum(1 - F) if media.tinted else leaves * dr.square(bs.eta)
+        light = way.light + dr.select(leaving, way.throughput * T * leaves * L_e, 0)
+
+        # ---- throughput *= T F', along the direction that is reflected inside
+        ctx.type_mask = mi.BSDFFlags.DeltaReflection
+        bs, mirrored = media.boundary(k).sample(ctx, out, 0.0, mi.Point2f(0), going)
+        d, _ = sided(out, bs.wo)
+        o, off = media.depart(out, d, mi.Bool(True))
+        throughput = way.throughput * T * mirrored
+        onward = WayThrough(o, off, d, throughput, going & (bs.pdf > 0) & (dr.dot(d, out.n) < 0),
+                            way.exits + dr.select(going, 1, 0), light)  # fmt: skip
+        return onward, dr.select(leaving, T * let_out, 0), nothing
 
     def _emission_along(
         self, si: mi.SurfaceInteraction3f, d: mi.Vector3f, active: mi.Bool
@@ -586,7 +647,9 @@ def _plus(record: LightRecord, walk: Walk, light: mi.Spectrum, slopes: Score | t
     return replace(record, L=record.L + walk.weight * light, slopes=slopes)
 
 
-def start_record(lanes: int, scored: bool = False, forward: bool = False, splits: bool = False) -> LightRecord:
+def start_record(
+    lanes: int, scored: bool = False, forward: bool = False, splits: bool = False, sees_through: bool = False
+) -> LightRecord:
     """The record of a path that begins at the camera."""
 
     def full(kind: type, value: float | bool | int) -> Any:
@@ -602,6 +665,7 @@ def start_record(lanes: int, scored: bool = False, forward: bool = False, splits
         precomputed=full(mi.Bool, False), known=full(mi.Bool, False), ended=full(mi.Bool, False),
         slopes=Score.sums(lanes) if scored else (),
         run=ForwardRun.none(lanes) if forward else (), shallow=full(mi.Bool, False) if splits else (),
+        exits=full(mi.UInt32, 0) if sees_through else (),
     )  # fmt: skip
 
 
@@ -820,9 +884,9 @@ class PathTracer:
             again = light.sighted & enters & same & self.visitor.straight_light.passes_again(near)
         light = replace(light, L=L, previous=dr.select(again, light.previous, si.p), sighted=again,
                         pdf=dr.select(again, light.pdf, bs.pdf), delta=delta & ~again, scattered=scattered,
-                        precomputed=dr.select(enters, seen.found, mirrored.found),
-                        run=light.run and light.run.ended(),
-                        shallow=held & enters if self.visitor.splits else ())  # fmt: skip
+                        precomputed=dr.select(enters, seen.exits > 0, mirrored.found),
+                        run=light.run and light.run.ended(), shallow=held & enters if self.visitor.splits else (),
+                        exits=dr.select(enters, seen.exits, 0) if self.visitor.sees_through else ())  # fmt: skip
         if behind is not None:
             L = L + self.visitor.spread_inner_lights(walk, scattered & enters)
             light = replace(light, delta=~again & (delta | enters | through | behind.unlit), L=L)
@@ -856,7 +920,7 @@ class PathTracer:
 
     def _seen(
         self, L: mi.Spectrum, p: CameraPath, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32, active: mi.Bool
-    ) -> tuple[Seen, Seen, mi.Spectrum, CameraPath]:
+    ) -> tuple[Seen, SeenThrough, mi.Spectrum, CameraPath]:
         """What object k mirrors, and what is seen through it, and the light with both, at first told apart."""
         # emission that rays find lacks delta lights: where a path has scattered, it meets their cones instead
         small = self.visitor.small
@@ -914,7 +978,8 @@ def _begin(
     walk = start_walk(o, d, rng, media.unknown(lanes, wavelengths))
     stay = Stay.none(lanes, media.textured) if scored else ()
     yes = dr.full(mi.Bool, True, lanes)
-    return CameraPath(index, walk, start_record(lanes, scored, visitor.forward, visitor.splits), no, first, yes, stay)
+    light = start_record(lanes, scored, visitor.forward, visitor.splits, visitor.sees_through)
+    return CameraPath(index, walk, light, no, first, yes, stay)
 
 
 # ---- First exits of paths from the camera ------------------------------------------------------------------------

@@ -426,6 +426,21 @@ def test_the_layer_of_emission_holds_the_mirror_and_what_is_behind_the_object() 
     assert image[..., 3:] == pytest.approx(image[..., :3], abs=1e-4)
 
 
+def test_the_layer_of_emission_holds_what_is_seen_through_an_object_after_reflections_inside() -> None:
+    """A cube that scatters nothing back and lets most light through, in a room with one window."""
+    clear, sky = {"sigma_s": 1e-6, "sigma_a": 0.06, "eta": 1.4}, np.full((16, 32, 3), 0.1, dtype=np.float32)
+    sky[2:6, 8:14] = 20.0
+    scene = _scene("auto", clear, _cube(), light={"type": "envmap", "bitmap": mi.Bitmap(sky)})
+    integrator = mi.load_dict({"type": "translucent_walk", "light": "precomputed", "layers": True})
+    image = np.array(mi.render(scene, spp=64, seed=1, integrator=integrator))
+    assert image[..., 3:] == pytest.approx(image[..., :3], abs=0.02 * float(image[..., :3].mean()))
+    by_chance = mi.load_dict({"type": "translucent_walk", "light": "sampled"})
+    means = np.array([mi.render(scene, spp=2048, seed=k, integrator=by_chance) for k in range(16)]).mean(axis=(1, 2, 3))
+    error = means.std(ddof=1) / 4
+    assert error < 0.004 * means.mean()
+    assert abs(image[..., :3].mean() - means.mean()) < 4 * error
+
+
 # ---- refusals
 
 
