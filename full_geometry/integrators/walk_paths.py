@@ -408,7 +408,7 @@ class LightVisitor:
         record = replace(record, previous=crossing.si.p, pdf=crossing.pdf, delta=crossing.delta)
         if self.unscattered is not None:
             brings = crossing.brings(self.media, walk.d) & (walk.order > 0)
-            if self.sees_through:  # `emitter_behind` knows so many reflections
+            if self.follows:  # `emitter_behind` knows so many reflections
                 exits = dr.maximum(record.exits, 1) - 1
                 record, brings = replace(record, exits=exits), brings | ((walk.order == 0) & (exits > 0))
             record = replace(record, precomputed=record.precomputed & (crossing.leaves | brings))
@@ -474,6 +474,11 @@ class LightVisitor:
         beyond = self.media.varies or self.media.carried or self.media.inner is not None
         return self.unscattered is not None and not beyond
 
+    @property
+    def follows(self) -> bool:
+        """Whether that is so after reflections inside them, too."""
+        return self.sees_through and self.unscattered.clear
+
     def seen_emitters(
         self, walk: Walk, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32, active: mi.Bool
     ) -> tuple[Seen, SeenThrough]:
@@ -511,17 +516,14 @@ class LightVisitor:
         bs, value = self.media.boundary(k).sample(ctx, si, 0.0, mi.Point2f(0), active)
         d, _ = sided(si, bs.wo)
         active = active & (bs.pdf > 0) & (dr.dot(d, si.n) < 0)
-        start = WayThrough(
-            *self.media.depart(si, d, mi.Bool(True)),
-            d,
-            walk.weight * value,
-            active,
-            dr.zeros(mi.UInt32, dr.width(d)),
-            mi.Spectrum(0),
-        )
+        o, off = self.media.depart(si, d, mi.Bool(True))
+        met = dr.zeros(mi.UInt32, dr.width(d))
+        start = WayThrough(o, off, d, walk.weight * value, active, met, mi.Spectrum(0))
         way, passed, nothing = self._seen_at_boundary(start, k, walk.rng)
 
         # ---- what is seen at those after reflections inside, as far as there is light
+        if not self.follows:
+            return SeenThrough(way.light, way.exits, dr.select(nothing, 1 - passed, 1))
         least = opaque(LEAST_REFLECTED) * dr.max(walk.weight * value)
 
         def on(way: WayThrough) -> mi.Bool:
@@ -648,7 +650,7 @@ def _plus(record: LightRecord, walk: Walk, light: mi.Spectrum, slopes: Score | t
 
 
 def start_record(
-    lanes: int, scored: bool = False, forward: bool = False, splits: bool = False, sees_through: bool = False
+    lanes: int, scored: bool = False, forward: bool = False, splits: bool = False, follows: bool = False
 ) -> LightRecord:
     """The record of a path that begins at the camera."""
 
@@ -665,7 +667,7 @@ def start_record(
         precomputed=full(mi.Bool, False), known=full(mi.Bool, False), ended=full(mi.Bool, False),
         slopes=Score.sums(lanes) if scored else (),
         run=ForwardRun.none(lanes) if forward else (), shallow=full(mi.Bool, False) if splits else (),
-        exits=full(mi.UInt32, 0) if sees_through else (),
+        exits=full(mi.UInt32, 0) if follows else (),
     )  # fmt: skip
 
 
@@ -886,7 +888,7 @@ class PathTracer:
                         pdf=dr.select(again, light.pdf, bs.pdf), delta=delta & ~again, scattered=scattered,
                         precomputed=dr.select(enters, seen.exits > 0, mirrored.found),
                         run=light.run and light.run.ended(), shallow=held & enters if self.visitor.splits else (),
-                        exits=dr.select(enters, seen.exits, 0) if self.visitor.sees_through else ())  # fmt: skip
+                        exits=dr.select(enters, seen.exits, 0) if self.visitor.follows else ())  # fmt: skip
         if behind is not None:
             L = L + self.visitor.spread_inner_lights(walk, scattered & enters)
             light = replace(light, delta=~again & (delta | enters | through | behind.unlit), L=L)
@@ -978,7 +980,7 @@ def _begin(
     walk = start_walk(o, d, rng, media.unknown(lanes, wavelengths))
     stay = Stay.none(lanes, media.textured) if scored else ()
     yes = dr.full(mi.Bool, True, lanes)
-    light = start_record(lanes, scored, visitor.forward, visitor.splits, visitor.sees_through)
+    light = start_record(lanes, scored, visitor.forward, visitor.splits, visitor.follows)
     return CameraPath(index, walk, light, no, first, yes, stay)
 
 

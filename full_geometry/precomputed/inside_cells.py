@@ -90,6 +90,7 @@ class InsideCells:
         place: (cut,) of each of them the place in `cut` of the cell whose fit it shares, its own for most.
         offset: of each the way from the centre of that one, in units of h.
         solve: (cut, 4, 4) in a row, coefficients of its fit from the moments ∫ f x_j dx / h³ of all that share it.
+        chord: mean chord 4 V / A of the object, scene units.
     """
 
     low: np.ndarray
@@ -101,11 +102,12 @@ class InsideCells:
     place: mi.UInt32
     offset: mi.Vector3f
     solve: mi.Float
+    chord: float
 
     @classmethod
     def of(
         cls, media: WalkMedia, k: int, points: SurfaceParts, box: tuple[np.ndarray, np.ndarray], h: float,
-        depths: tuple[float, float],
+        depths: tuple[float, float], chord: float,
     ) -> InsideCells:  # fmt: skip
         """The cells of object k.
 
@@ -114,6 +116,7 @@ class InsideCells:
             box: its least and largest coordinates.
             h: edge of a cell, from `cell_edge`.
             depths: below the surface, beyond which cells are coarse, and beyond which there are none, scene units.
+            chord: mean chord of the object, scene units.
         """
         # ---- bricks that surfaces cut and those near the own, and cells of the former that they cut
         counts = brick_counts(box, h)
@@ -149,7 +152,7 @@ class InsideCells:
         return cls(
             low=low, h=h, counts=counts, index=index, slots=slots,
             cut=aligned(mi.UInt32, slot[at[row], bit]), place=aligned(mi.UInt32, place),
-            offset=of_rows(mi.Vector3f, offset), solve=floats(_solutions(moments, place, offset)),
+            offset=of_rows(mi.Vector3f, offset), solve=floats(_solutions(moments, place, offset)), chord=chord,
         )  # fmt: skip
 
     def share(self, sums: mi.Float, n: int, moments: bool = False) -> None:

@@ -59,6 +59,7 @@ DEPTHS = 3.6, 9.0  # mean free paths below the surface, at which cells are coars
 ALONG, FORWARD_ALONG = 6, 1  # points on a segment of a ray; forward events part it into many
 FEWEST_POINTS, MOST_POINTS = 2**14, 2**18  # of the surface that find its cells, of all and at once
 MOST_INTEGER = 2**15 - 1  # of 16 bits, for a direction of 1
+CLEAR = 1.5  # mean free paths
 MOST_BENT = math.radians(35)  # of 29 light was within .5 %, of 38 to 55 it was 1 to 5 % too bright
 MOST_TRUNCATED = 0.1  # abs(g) beside textures of media: at 0.3 and 0.5 light under a lamp was 2 to 3 % off
 FEWEST_PATHS, RAYS_PER_PATH = 2**14, 4  # of scattered light from each object, if it has so many rays for each
@@ -78,6 +79,8 @@ class UnscatteredLight:
             None where that is left to walks.
         tables: by the number of an object, where its bricks begin, their corner, 1/h and counts.
         forward: whether it has met forward events, see `forward_scattering`.
+        clear: whether light that is reflected inside leaves an object unscattered, which hardly reaches the next
+            boundary of others.
     """
 
     index: CellIndex
@@ -85,6 +88,7 @@ class UnscatteredLight:
     directions: mi.UInt32 | None
     tables: dict[str, Any]
     forward: bool
+    clear: bool
     scattered: mi.Float | None = None
 
     def light(self, media: WalkMedia, event: Event, last: mi.Bool | bool = False) -> tuple[mi.Spectrum, mi.Bool]:
@@ -149,11 +153,17 @@ def unscattered_light(
         fluence.append(D)
     light = _joined(fluence), _joined(directions) if directional else None
     dr.make_opaque(light)
-    found = UnscatteredLight(index, *light, tables, forward(media))
+    found = UnscatteredLight(index, *light, tables, forward(media), _clear(media, cells))
     if paths:
         found = _with_paths(scene, media, seed, found, cells, paths, min(FEWEST_PATHS, rays // RAYS_PER_PATH))
     dr.sync_thread()  # callers time this
     return found
+
+
+def _clear(media: WalkMedia, cells: list[InsideCells]) -> bool:
+    """Whether the mean chord of an object is below CLEAR mean free paths of a channel."""
+    specs = [media.specs[kind] for kind in media.instance_table.kind]
+    return any(grid.chord * media.mm_per_unit * np.min(spec.medium.sigma_t) < CLEAR for grid, spec in zip(cells, specs))
 
 
 def _in_one_table(cells: list[InsideCells]) -> tuple[CellIndex, dict[str, Any]]:
@@ -289,8 +299,9 @@ def inside_cells_of(
         if same and _grid(before, k)[1:] == (h, depths):
             results.append(cells[k])
             continue
-        points = partial(_surface_points, media, k, _extent(media, k)[0])
-        results.append(InsideCells.of(media, k, points, box, h, depths))
+        area, volume = _extent(media, k)
+        points = partial(_surface_points, media, k, area)
+        results.append(InsideCells.of(media, k, points, box, h, depths, 4 * volume / area))
     return results
 
 
