@@ -49,6 +49,7 @@ from halfspace_sss.backend import clock
 from halfspace_sss.checks import check_choice, check_flag, check_interval
 from halfspace_sss.interrupts import checkpoint, interruptible
 
+SUN = 0.02  # radians, below which what a clear object shows of an emitter after reflections is fireflies
 PARAMETERS = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters", "connection_share", "blur", "light", "layers")
 SAMPLES_PER_LAUNCH = 2**19
 LAYER = ["emission.R", "emission.G", "emission.B"]
@@ -170,6 +171,7 @@ def _class(variant: str) -> type:
             visitor = LightVisitor(
                 scene=scene, media=media, small=small, connections=connections, directions=directions,
                 straight_light=straight, inner_lights=inner, blur=self.blur, unscattered=light, outgoing=self.outgoing,
+                reflections=light is not None and light.clear and no_sun(media, small),
             )  # fmt: skip
             return PathTracer(visitor, self.max_depth, self.rr_depth, self.hidden, self.layers)
 
@@ -378,6 +380,14 @@ def _check_followed(scene: mi.Scene) -> None:
                 f"{key} must not have gradients enabled: translucent_walk differentiates light by albedo, sigma_t and "
                 "g of translucent surfaces and by their textures; bssrdf by emitters and other textures too"
             )
+
+
+def no_sun(media: WalkMedia, small: SmallEmitters | None) -> bool:
+    """Whether no emitter that rays meet looks smaller than SUN from the objects."""
+    if small is None or not small.some_met:
+        return True
+    k = dr.arange(mi.UInt32, small.n_delta, len(small))
+    return bool(dr.all(small.angle2(k, mi.Point3f(media.scene.bbox().center())) > SUN**2))
 
 
 def _render(

@@ -150,6 +150,7 @@ class LightVisitor:
         unscattered: light that events find precomputed, in place of connections, directions and straight light.
         outgoing: deep light of objects, of paths inside that begin with two scattering events, known where they go in.
         deep: whether that light alone counts, of the object that a path meets first.
+        reflections: whether emission behind objects is found after reflections inside, too.
     """
 
     scene: mi.Scene
@@ -163,6 +164,7 @@ class LightVisitor:
     unscattered: UnscatteredLight | None = None
     outgoing: OutgoingLight | None = None
     deep: bool = False
+    reflections: bool = False
 
     @property
     def splits(self) -> bool:
@@ -477,7 +479,7 @@ class LightVisitor:
     @property
     def follows(self) -> bool:
         """Whether that is so after reflections inside them, too."""
-        return self.sees_through and self.unscattered.clear
+        return self.sees_through and self.reflections
 
     def seen_emitters(
         self, walk: Walk, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32, active: mi.Bool
