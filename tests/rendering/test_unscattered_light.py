@@ -426,11 +426,27 @@ def test_the_layer_of_emission_holds_the_mirror_and_what_is_behind_the_object() 
     assert image[..., 3:] == pytest.approx(image[..., :3], abs=1e-4)
 
 
+CLEAR = {"sigma_s": 1e-6, "sigma_a": 0.06, "eta": 1.4}
+
+
+def _window() -> dict:
+    sky = np.full((16, 32, 3), 0.1, dtype=np.float32)
+    sky[2:6, 8:14] = 20.0
+    return {"type": "envmap", "bitmap": mi.Bitmap(sky)}
+
+
+@pytest.mark.parametrize(("what", "follows"), [("clear", True), ("dense", False), ("sun", False)])
+def test_reflections_are_followed_in_clear_objects_unless_an_emitter_is_as_small_as_a_sun(
+    what: str, follows: bool
+) -> None:
+    lamp = _lamp(0.1) if what == "sun" else _lamp()
+    scene = _scene("precomputed", MEDIUM if what == "dense" else CLEAR, _cube(), lamp=lamp)
+    assert scene.integrator().tracer(scene, 0, 64).visitor.follows == follows
+
+
 def test_the_layer_of_emission_holds_what_is_seen_through_an_object_after_reflections_inside() -> None:
     """A cube that scatters nothing back and lets most light through, in a room with one window."""
-    clear, sky = {"sigma_s": 1e-6, "sigma_a": 0.06, "eta": 1.4}, np.full((16, 32, 3), 0.1, dtype=np.float32)
-    sky[2:6, 8:14] = 20.0
-    scene = _scene("auto", clear, _cube(), light={"type": "envmap", "bitmap": mi.Bitmap(sky)})
+    scene = _scene("auto", CLEAR, _cube(), light=_window())
     integrator = mi.load_dict({"type": "translucent_walk", "light": "precomputed", "layers": True})
     image = np.array(mi.render(scene, spp=64, seed=1, integrator=integrator))
     assert image[..., 3:] == pytest.approx(image[..., :3], abs=0.02 * float(image[..., :3].mean()))
