@@ -105,7 +105,8 @@ class MixedHalves(NamedTuple):
         coarse = [gaussian_filter(x, (COARSE, COARSE, 0)) for x in (to_B, to_A, noise)]
         s, s_coarse = (_share(*parts) for parts in ((to_B, to_A, noise), coarse))
 
-        # ---- K of each
+        # ---- K of each, but none where nothing is seen
+        s, s_coarse = (np.where((A == 0) & (B == 0) & (D_A == 0) & (D_B == 0), 0, share) for share in (s, s_coarse))
         P, Q, N = (s * x + (s_coarse - s) * low for x, low in zip((to_B, to_A, noise), coarse))
         return cls(D_A + P, D_B + Q, N, A, B)
 

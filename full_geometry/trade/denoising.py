@@ -80,9 +80,11 @@ class Denoiser:
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """The colours (H, W, 3) without noise; a layer of emission stays as it is: edges of lamps in mirrors are sharp.
+        So do pixels without a surface, into which objects would shine.
         `image`: linear radiance (H, W, channels), the last three the emission if the integrator has that layer and
         there are more than three."""
         # filters with negative lobes go below 0
         light = np.maximum(image[..., :3] if image.shape[2] >= 3 else image[..., :1].repeat(3, axis=2), 0.0)
         emission = np.clip(image[..., -3:], 0.0, light) if self._layered and image.shape[2] > 3 else 0.0
-        return denoised((light - emission).astype(np.float32), *self._guides)[0] + emission
+        rest, bare = (light - emission).astype(np.float32), ~np.any(self._guides, axis=(0, 3))
+        return np.where(bare[..., None], rest, denoised(rest, *self._guides)[0]) + emission

@@ -91,3 +91,19 @@ def test_a_denoiser_that_is_worse_than_the_noise_gives_way() -> None:
     found = _passes(truth, [4] * 16, 0.2, 0)
     off = [np.sqrt(np.square(x - truth).mean()) for x in (cross_denoised(found, _blurred).image, found.mean)]
     assert off[0] < 1.1 * off[1]
+
+
+def test_a_denoised_image_is_black_beside_an_object_that_stands_before_nothing() -> None:
+    from full_geometry.scenes.reference import cross_denoised
+    from full_geometry.scenes.reference_store import Reference
+    from full_geometry.trade.denoising import Denoiser, cover
+
+    pytest.importorskip("mitsuba_oidn")
+    scene = mi.load_dict({key: value for key, value in _scene().items() if key != "sky"})
+    found = Reference.empty((24, 24, 3), {}, halves=True)
+    for seed in range(4):
+        found = found.add(np.array(mi.render(scene, spp=1, seed=seed)), 1, 0.0)
+    beside, clean = cover(scene) == 0, cross_denoised(found, Denoiser(scene)).image
+    assert beside.sum() > 100
+    assert (clean[beside] == found.mean[beside]).all()
+    assert clean[12, 12].min() > 0
