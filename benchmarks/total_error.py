@@ -29,7 +29,7 @@ from benchmarks.speeds import VOLUMES, LitObject
 from figures.computing.scans import prepare
 from figures.parts.part import Row
 from full_geometry.geometry.sensors import sampled_size
-from full_geometry.scenes.reference import Denoise, MixedHalves, cross_denoised
+from full_geometry.scenes.reference import Denoise, MixedHalves
 from full_geometry.scenes.reference_store import LIGHT, Reference
 from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
 from full_geometry.trade.denoising import Denoiser, cover
@@ -128,8 +128,7 @@ def _measured(case: LitObject, how: TotalErrors, folder: Path) -> tuple[list[Row
     # ---- a row for each, raw and denoised
     rows, images, middle = [], {REFERENCE: R}, how.seconds[len(how.seconds) // 2]
     for (way, limit), average in found.items():
-        results = average.mean[..., :3], cross_denoised(average, denoise).image
-        for name, result, told in zip(("raw", "denoised"), results, _told(average, denoise, inside)):
+        for name, (result, told) in zip(("raw", "denoised"), _results(average, denoise, inside)):
             pixels, blocks = (_error(result, R, noise, inside, size) for size in (1, BLOCK))
             if limit == middle:
                 images[f"{way}, {name}"] = result
@@ -145,14 +144,16 @@ def _measured(case: LitObject, how: TotalErrors, folder: Path) -> tuple[list[Row
     return rows, images
 
 
-def _told(found: Reference, denoise: Denoise, inside: np.ndarray) -> tuple[float, float]:
-    """What the halves and the light tell of the error over the pixels of the object, raw and denoised."""
+def _results(found: Reference, denoise: Denoise, inside: np.ndarray) -> list[tuple[np.ndarray, float]]:
+    """The image raw and denoised, and what halves and light tell of its error over the pixels of the object."""
+    raw = found.mean[..., :3]
     if found.passes < 2:
-        return np.inf, np.inf
-    variance = found.variance[inside, :3].sum()
-    squared, noise = (x[inside].sum() for x in MixedHalves.of(found, denoise).squared())
-    whole = max(np.square(found.mean[inside, :3]).sum() - variance, 1e-30)
-    return tuple(float(np.hypot(np.sqrt(v / whole), found.light_error)) for v in (variance, max(squared, noise)))
+        return [(raw, np.inf), (denoise(found.mean), np.inf)]
+    mixed, variance = MixedHalves.of(found, denoise), found.variance[inside, :3].sum()
+    squared, noise = (x[inside].sum() for x in mixed.squared())
+    whole = max(np.square(raw[inside]).sum() - variance, 1e-30)
+    each = (raw, variance), (0.5 * (mixed.P + mixed.Q), max(squared, noise))
+    return [(image, float(np.hypot(np.sqrt(off / whole), found.light_error))) for image, off in each]
 
 
 def _averaged(images: np.ndarray, spp: int, light: float = 0.0) -> Reference:
