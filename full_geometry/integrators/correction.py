@@ -48,7 +48,9 @@ from full_geometry.precomputed.surface_regression import (
     painted,
     smooth_field,
 )
+from full_geometry.precomputed.transport_matrix import FEWEST as FEWEST_POINTS
 from full_geometry.precomputed.transport_matrix import Albedo, bent, count_of
+from full_geometry.precomputed.unscattered_light import ImageSamples
 from full_geometry.settings import Settings
 from full_geometry.surface.varying import equivalent
 from full_geometry.surface.wrapped import surface_of
@@ -238,7 +240,8 @@ class Corrections:
         missing = [k for k, g in enumerate(gathered) if g and self._launches(k) < launches]
         if missing or walk.outgoing is None:
             walk.outgoing = None
-            tracer = walk.tracer(scene, SEED, max(SAMPLES_OF_LIGHT * number, FEWEST_OF_LIGHT))
+            samples = max(SAMPLES_OF_LIGHT * number, FEWEST_OF_LIGHT)
+            tracer = walk.tracer(scene, SEED, ImageSamples(samples, FEWEST_POINTS))
             tracer = replace(tracer, visitor=replace(tracer.visitor, deep=True))
             for k in missing:
                 known, light = self._known[k], self._lights[k]

@@ -30,6 +30,7 @@ from full_geometry.objects.inclusions import check_sensors
 from full_geometry.objects.objects import KnowsUnit, check_size, places_of, translucent_shapes
 from full_geometry.objects.small_emitters import SmallEmitters
 from full_geometry.precomputed.unscattered_light import (
+    ImageSamples,
     UnscatteredLight,
     holds_scattered,
     inside_cells_of,
@@ -53,9 +54,7 @@ SUN = 0.02  # radians, below which what a clear object shows of an emitter after
 PARAMETERS = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters", "connection_share", "blur", "light", "layers")
 SAMPLES_PER_LAUNCH = 2**19
 LAYER = ["emission.R", "emission.G", "emission.B"]
-SAMPLES_PER_RAY = 4  # of the image, for each ray of light: these take a tenth of the time or less
-SAMPLES_PER_PATH = 4  # the same for each path of scattered light; of milk in glass and a statue, 8, 2 and 1 were worse
-FEWEST_RAYS, MOST_RAYS = 2**16, 2**21
+FEWEST_RAYS = 2**16  # of light, for each object
 PREVIEW_RAYS = 2**14  # of a first look at light that has changed
 FOREVER, DEPTHS = 2**31 - 1, {"max_depth": -1, "rr_depth": 5}
 WIDEST = 20.0  # blur: 1 and 3 radians
@@ -119,27 +118,27 @@ def _class(variant: str) -> type:
             """Light that leaves objects of a scene, by which walks end, and light inside; until something changes."""
             self.outgoing, self._kept = outgoing, (light_state(scene), light)
 
-        def prepare(self, scene: mi.Scene, samples: int, seed: int = 0) -> None:
+        def prepare(self, scene: mi.Scene, image: ImageSamples, seed: int = 0) -> None:
             """Precompute light once for all calls of `sample`, until objects or emitters change.
 
             `filling` has the seconds that each image takes for it; media and cells are made once.
-            `samples`: of an image, by which the light has its rays.
+            `image`: that the light is for.
 
             Raises:
                 ValueError: light cannot be precomputed in this scene, and is asked for.
             """
             with interruptible(), undisturbed(), dr.suspend_grad():
-                self._kept = light_state(scene), self.tracer(scene, seed, samples).visitor.unscattered
+                self._kept = light_state(scene), self.tracer(scene, seed, image).visitor.unscattered
 
         def tracer(
-            self, scene: mi.Scene, seed: int = 0, samples: int = 0, scored: bool = False,
+            self, scene: mi.Scene, seed: int = 0, image: ImageSamples | None = None, scored: bool = False,
             light: UnscatteredLight | None = None, exits: bool = False, fewest: int = FEWEST_RAYS,
         ) -> PathTracer:  # fmt: skip
             """What paths through a scene need; its objects are made ready once, its emitters may have been edited.
 
             Args:
                 seed: of the light that is precomputed.
-                samples: of the image, by which that light has its rays; 0 leaves it to be sampled.
+                image: that it is for; None leaves light to be sampled.
                 scored: whether derivatives are asked for, which leave light to be sampled.
                 light: that is known already.
                 exits: whether walks have to leave, so that scattered light is not precomputed.
@@ -149,15 +148,14 @@ def _class(variant: str) -> type:
             media, small = self.media(scene), SmallEmitters.of(scene)
             inner = InnerLights.of(media, self.blur)
 
-            # ---- light inside, precomputed by as many rays as the image has samples for
-            if samples and self.precomputes(scene, media):
+            # ---- light inside, precomputed by as many rays as the samples of the image pay
+            if image is not None and self.precomputes(scene, media):
                 if self._cells[0] is not media:
                     self._cells = media, inside_cells_of(media, *self._cells)
                 if light is None:
-                    started, rays = clock(), min(max(samples // SAMPLES_PER_RAY, fewest), MOST_RAYS)
+                    started = clock()
                     ends = holds_scattered(media) and inner is None and self.max_depth == FOREVER and not exits
-                    paths = samples // SAMPLES_PER_PATH + 1 if ends else 0
-                    light = unscattered_light(scene, media, seed, self._cells[1], rays, paths)
+                    light = unscattered_light(scene, media, seed, self._cells[1], image, fewest, ends)
                     self.filling = clock() - started
                 connections, directions, straight = None, None, None
 
@@ -204,9 +202,11 @@ def _class(variant: str) -> type:
             spp = checked_samples(sensor, spp)
             with interruptible(), undisturbed(), dr.suspend_grad():
                 seed = int(mi.UInt32(seed)[0])
-                samples = spp * int(dr.prod(sampled_size(sensor.film())))
+                pixels = int(dr.prod(sampled_size(sensor.film())))
                 light = self._kept[1] if self.outgoing is not None else None
-                tracer = self.tracer(scene, seed, samples, light=light, exits=keep is not None)
+                tracer = self.tracer(
+                    scene, seed, ImageSamples(spp * pixels, pixels), light=light, exits=keep is not None
+                )
                 _render(tracer, sensor, seed, spp, keep, False, self._glints_in(scene, tracer, sensor, spp))
                 return sensor.film().develop() if develop else None
 
@@ -220,7 +220,7 @@ def _class(variant: str) -> type:
             """
             with interruptible(), undisturbed(), dr.suspend_grad():
                 light = self._kept_light(scene)
-                tracer = self.tracer(scene, seed, 1, light=light, fewest=PREVIEW_RAYS)
+                tracer = self.tracer(scene, seed, ImageSamples(0, 1), light=light, fewest=PREVIEW_RAYS)
                 if light is None:
                     self._kept = light_state(scene), tracer.visitor.unscattered
                 found = self._glints_in(scene, tracer, sensor, spp) if glints else None
@@ -255,7 +255,8 @@ def _class(variant: str) -> type:
         ) -> tuple:
             with undisturbed(), dr.suspend_grad():
                 seed = tuple(int(2**24 * sampler.next_1d()[0]) for _ in range(2))
-                tracer = self.tracer(scene, seed[0], sampler.wavefront_size(), light=self._kept_light(scene))
+                n = sampler.wavefront_size()
+                tracer = self.tracer(scene, seed[0], ImageSamples(n, n), light=self._kept_light(scene))
                 rays = tracer.shown(widened(ray, sampler.wavefront_size()))
                 L, seen, emission = tracer.trace(rays, on_device(PATH_LANES), seed)
             layer = list(mi.Color3f(emission)) if self.layers else []

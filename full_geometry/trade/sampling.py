@@ -21,6 +21,7 @@ from full_geometry.integrators.correction import FEWEST as FEWEST_WALKS
 from full_geometry.integrators.correction import SAMPLES_PER_WALK
 from full_geometry.integrators.gathering import PART
 from full_geometry.precomputed.transport_matrix import R_2
+from full_geometry.precomputed.unscattered_light import ImageSamples
 from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.settings import variant_channels
 from full_geometry.surface.wrapped import surface_of
@@ -152,11 +153,11 @@ def warm_up(stage: Stage, techniques: Sequence[Technique]) -> None:
 def _prepare(stage: Stage, technique: Technique) -> None:
     integrator, scene = stage.integrator(technique), stage.scene
     if technique.light == PRECOMPUTED:
-        integrator.prepare(scene, stage.light_samples, technique.part)
+        integrator.prepare(scene, ImageSamples(stage.light_samples, stage.pixels), technique.part)
         most = int(stage.light_samples * FILLING / max(integrator.filling, 1e-9))
         if technique.part == 1 and stage.light_samples == FEWEST_LIT and most > 2 * FEWEST_LIT:
             stage.light_samples = min(most, MOST_LIT)
-            integrator.prepare(scene, stage.light_samples, technique.part)
+            integrator.prepare(scene, ImageSamples(stage.light_samples, stage.pixels), technique.part)
     else:
         (integrator.prepare if is_bssrdf(integrator) else integrator.tracer)(scene)
 

@@ -131,7 +131,12 @@ class Stage:
     @property
     def lit(self) -> float:
         """Samples of a pixel that light is precomputed for."""
-        return self.light_samples / math.prod(int(n) for n in self.scene.sensors()[0].film().crop_size())
+        return self.light_samples / self.pixels
+
+    @property
+    def pixels(self) -> int:
+        """The number of pixels of the picture."""
+        return math.prod(int(n) for n in self.scene.sensors()[0].film().crop_size())
 
     @property
     def names(self) -> list[str]:

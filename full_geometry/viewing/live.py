@@ -18,6 +18,7 @@ from full_geometry.geometry.sensors import seeded
 from full_geometry.geometry.snapshot import differing
 from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.objects.objects import translucent_shapes
+from full_geometry.precomputed.unscattered_light import ImageSamples
 from full_geometry.scenes.gltf import is_gltf
 from full_geometry.scenes.reference import check_sensor
 from full_geometry.scenes.reference_store import Reference, finite_pixels
@@ -228,7 +229,7 @@ class LiveScene:
                 pixels, most = camera.width * camera.height, on_device(SAMPLES_OF_LIGHT)
                 if mean is not None and mean.spp >= lit + min(lit, most / pixels):
                     lit = mean.spp
-                    integrator.prepare(self.scene, min(lit * pixels, most), number)
+                    integrator.prepare(self.scene, ImageSamples(min(lit * pixels, most), pixels), number)
                 draw = partial(integrator.preview, glints=True)
             image = image_of(draw, self.scene, sensor, number, spp)
             last = time.perf_counter() - begun

@@ -128,12 +128,13 @@ def test_one_kernel_traces_paths_of_the_image_and_those_that_tell_its_glints():
 
 def test_glints_of_all_channels_are_traced_at_once_in_films_of_all_sizes():
     from full_geometry.integrators.glints import Glints, glint_light, glints_of
+    from full_geometry.precomputed.unscattered_light import ImageSamples
 
     found = []
     for side in (4, 6):
         gc.collect()
         scene = _ball(np.random.default_rng(1), "precomputed", side)
-        sensor, tracer = scene.sensors()[0], scene.integrator().tracer(scene, 0, 16)
+        sensor, tracer = scene.sensors()[0], scene.integrator().tracer(scene, 0, ImageSamples(16, 16))
         glints = Glints(mi.UInt32(1, 2), mi.Point2f(0, [0.2, 0.4]), mi.Point2f(1, [0.6, 0.8]))
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True), dr.suspend_grad():
             dr.kernel_history_clear()

@@ -341,7 +341,7 @@ def test_precomputed_light_of_a_lamp_has_the_mean_of_sampled_light_where_scatter
         rough = {"type": "roughdielectric", "alpha": 0.3, "int_ior": 1.4, "ext_ior": 1.0}
         _compare({**FORWARD, "g": 0.8, "boundary": rough}, 0.012, spp=768, fewer=1, **lamp)
     else:  # 5 mean free paths
-        _compare({**MEDIUM, "g": 0.9}, 0.02, _ball(2.0), spp=6144, **lamp)
+        _compare({**MEDIUM, "g": 0.9}, 0.02, _ball(2.0), spp=6144, fewer=3, **lamp)
 
 
 @pytest.mark.slow
@@ -439,9 +439,11 @@ def _window() -> dict:
 def test_reflections_are_followed_in_clear_objects_unless_an_emitter_is_as_small_as_a_sun(
     what: str, follows: bool
 ) -> None:
+    from full_geometry.precomputed.unscattered_light import ImageSamples
+
     lamp = _lamp(0.1) if what == "sun" else _lamp()
     scene = _scene("precomputed", MEDIUM if what == "dense" else CLEAR, _cube(), lamp=lamp)
-    assert scene.integrator().tracer(scene, 0, 64).visitor.follows == follows
+    assert scene.integrator().tracer(scene, 0, ImageSamples(64, 64)).visitor.follows == follows
 
 
 def test_the_layer_of_emission_holds_what_is_seen_through_an_object_after_reflections_inside() -> None:

@@ -101,7 +101,7 @@ def test_walks_keep_the_light_inside_while_the_camera_moves(live: LiveScene, mon
     way, filled, find = Way("path_traced", "precomputed"), [], translucent_walk.unscattered_light
 
     def counted(*args: Any) -> object:
-        filled.append(args[4])
+        filled.append(args[5])
         return find(*args)
 
     monkeypatch.setattr(translucent_walk, "unscattered_light", counted)

@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 from figures import app as cli
 from full_geometry.integrators import translucent_walk
+from full_geometry.precomputed.unscattered_light import ImageSamples
 from full_geometry.trade import advice, assess, automatic, measuring, recommend, recommend_flat
 from full_geometry.trade.assessing import assess_stage
 from full_geometry.trade.denoised_walks import Tiles, _apart, _side_by_side
@@ -248,7 +249,7 @@ def test_light_that_is_kept_for_samples_is_precomputed_anew_where_an_emitter_has
     walks = mi.load_dict({"type": "translucent_walk", "light": "precomputed", "hide_emitters": True})
     (exits,) = visible_exits(loaded, list(loaded.shapes()), 0, 32, 0)
     rays, means = exits.rays(64), []
-    walks.prepare(loaded, 2**18)
+    walks.prepare(loaded, ImageSamples(2**18, 2**8))
     for _ in range(2):
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(1, exits.n * 64)
