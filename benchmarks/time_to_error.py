@@ -1,5 +1,7 @@
 """CPU seconds from a fresh scene to a total error of denoised path tracing, at kernels that are known.
 
+All counts: light inside, albedo and normals for the denoiser, passes, and all denoising.
+
 Passes grow. Whenever the samples have grown by what the last errors ask for, by half at least, the halves are denoised
 and compared (`full_geometry.scenes.reference`), for pixels and for means over blocks of 8 x 8. No reference is
 rendered: the error is estimated without bias from the halves, but for the bias of precomputed light, below .3 %. The
@@ -29,7 +31,7 @@ from full_geometry.trade.denoising import Denoiser
 
 FEWEST_PASSES = 8
 GROWTH, MOST_GROWTH = 1.5, 4.0  # of samples between errors
-SHARE, LARGEST_PASS = 8, 64  # of passes
+SHARE, LARGEST_PASS = 4, 64  # of passes, as `render` takes them
 
 
 @dataclass(frozen=True)
@@ -68,10 +70,11 @@ def times_to_error(
 def _row(case: LitObject, way: str, how: ErrorsWanted, folder: Path) -> Row:
     """Passes of a fresh scene until both errors are reached; a scene before it compiles the kernels."""
     compiled = lit_scene(case, way, how.size, folder)
-    denoise = Denoiser(compiled if isinstance(compiled, mi.Scene) else compiled[0])
+    _denoiser(compiled)
     for spp in (1, 2, 4):  # kernels of passes with more are these
         image_of_pass(compiled, spp, how.seed)
     scene, started, seed = lit_scene(case, way, how.size, folder), time.process_time(), how.seed + 1
+    denoise = _denoiser(scene)
     found, wanted, most = None, 0.0, how.most if way == PRECOMPUTED else how.volume
     while True:
         done = found.spp if found else 0
@@ -94,6 +97,10 @@ def _row(case: LitObject, way: str, how: ErrorsWanted, folder: Path) -> Row:
         "object": case.name, "light": case.light, "way": way, "seconds": seconds if reached else np.inf,
         "spp": found.spp, **told, "seconds, at least": max(over, 1) ** 2 * seconds, "seconds, raw": raw,
     }  # fmt: skip
+
+
+def _denoiser(scene: mi.Scene | tuple[mi.Scene, ...]) -> Denoiser:
+    return Denoiser(scene if isinstance(scene, mi.Scene) else scene[0])
 
 
 def _errors(found: Reference, denoise: Denoise) -> dict[str, float]:

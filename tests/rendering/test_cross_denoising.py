@@ -107,3 +107,47 @@ def test_a_denoised_image_is_black_beside_an_object_that_stands_before_nothing()
     assert beside.sum() > 100
     assert (clean[beside] == found.mean[beside]).all()
     assert clean[12, 12].min() > 0
+
+
+def test_guides_of_a_view_out_of_focus_lose_their_noise() -> None:
+    from full_geometry.trade.denoising import guides, without_noise
+
+    pytest.importorskip("mitsuba_oidn")
+    tiles = {"type": "checkerboard", "to_uv": mi.ScalarTransform4f().scale([20, 20, 1])}
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": {
+                "type": "thinlens",
+                "aperture_radius": 0.4,
+                "focus_distance": 3.0,
+                "to_world": mi.ScalarTransform4f().look_at([0, 0, 6], [0, 0, 0], [0, 1, 0]),
+                "film": {"type": "hdrfilm", "width": 96, "height": 96, "rfilter": {"type": "box"}},
+            },
+            "wall": {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().scale(5),
+                "bsdf": {"type": "diffuse", "reflectance": tiles},
+            },
+        }
+    )
+    noisy, exact = guides(scene, spp=16)[0], guides(scene, spp=1024)[0]
+    clean = without_noise("albedo", noisy)
+    assert np.square(clean - exact).mean() < 0.5 * np.square(noisy - exact).mean()
+
+
+def test_pixels_far_from_surfaces_do_not_change_what_is_denoised() -> None:
+    from full_geometry.trade.denoising import MARGIN, Denoiser
+
+    pytest.importorskip("mitsuba_oidn")
+    side, at = 192, 96
+    film = {"type": "hdrfilm", "width": side, "height": side, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    scene = _scene()
+    scene["sensor"] = {**scene["sensor"], "film": film, "fov": 60.0}
+    denoise = Denoiser(mi.load_dict(scene))
+    image = np.random.default_rng(1).random((side, side, 3)).astype(np.float32)
+    lamp = image.copy()
+    lamp[0, 0] = 1e4
+    first, second = denoise(image), denoise(lamp)
+    assert MARGIN < at and np.array_equal(first[at, at], second[at, at])
+    assert second[0, 0, 0] == np.float32(1e4) and not np.array_equal(first[at, at], image[at, at])
