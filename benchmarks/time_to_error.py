@@ -2,8 +2,8 @@
 
 All counts: light inside, albedo and normals for the denoiser, passes, and all denoising.
 
-Passes grow. Whenever the samples have grown by what the last errors ask for, by half at least, the halves are denoised
-and compared (`full_geometry.scenes.reference`), for pixels and for means over blocks of 8 x 8. No reference is
+Passes grow. Whenever the samples have grown by what the last errors ask for, the halves are denoised and compared, as
+`full_geometry.scenes.reference` does, for pixels and for means over blocks of 8 x 8. No reference is
 rendered: the error is estimated without bias from the halves, but for the bias of precomputed light, below .3 %. The
 time of raw path tracing follows from its variance, and a lower bound of a denoised one that is given up from its error,
 which falls by the root of the samples at most. Ways are walks with precomputed light and Mitsuba's `volpathmis`.
@@ -25,12 +25,10 @@ from benchmarks.speeds import VOLUMES, LitObject
 from benchmarks.total_error import BLOCK, PRECOMPUTED, image_of_pass, lit_scene
 from figures.computing.scans import prepare
 from figures.parts.part import Row
-from full_geometry.scenes.reference import Denoise, MixedHalves
+from full_geometry.scenes.reference import FEWEST_PASSES, Denoise, MixedHalves, samples_to
 from full_geometry.scenes.reference_store import Reference
 from full_geometry.trade.denoising import Denoiser
 
-FEWEST_PASSES = 8
-GROWTH, MOST_GROWTH = 1.5, 4.0  # of samples between errors
 SHARE, LARGEST_PASS = 4, 64  # of passes, as `render` takes them
 
 
@@ -86,7 +84,7 @@ def _row(case: LitObject, way: str, how: ErrorsWanted, folder: Path) -> Row:
             continue
         errors = _errors(found, denoise)
         over = max(errors["pixels"] / how.pixels, errors["blocks"] / how.blocks)
-        wanted = found.spp * min(max(over**2, GROWTH), MOST_GROWTH)
+        wanted = samples_to(over, 1.0, found.spp)
         seconds = time.process_time() - started
         reached = over <= 1
         if reached or seconds > most:

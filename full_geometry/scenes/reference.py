@@ -147,7 +147,7 @@ def cross_denoised(found: Reference, denoise: Denoise) -> Denoised:
 FEWEST_PASSES = 8  # before the spread of the passes is trusted to stop a run
 SHARE = 4  # a growing pass has at most a quarter of the samples so far: enough passes for their spread, few launches
 MOST_PIXELS = 2**26  # 8192 x 8192: the numbers of the pixels alone take some 10 GB
-DENOISED_AGAIN = 1.5  # times the samples, from which on the error of a denoised image is computed anew
+SOONEST, LATEST = 1.25, 4.0  # times the samples, at which the error of a denoised image is computed anew
 LARGEST_PASS = 64  # samples per pixel: an interrupt waits for one pass
 Progress = Callable[[Reference], None]
 
@@ -221,7 +221,7 @@ def _in_passes(
             start = result or Reference.empty((), about, denoise is not None)
             result = _pass(start, scene, integrator, limits)
             if denoise is not None and limits.target_error is not None:
-                result = _with_error(result, denoise)
+                result = _with_error(result, denoise, limits.target_error)
             if time.monotonic() - last >= limits.interval:
                 _keep(path, result)
                 written, last = result, time.monotonic()
@@ -233,10 +233,15 @@ def _in_passes(
     return result
 
 
-def _with_error(found: Reference, denoise: Denoise) -> Reference:
-    """A render that knows the error of its denoised image, of now or of when it had most of its samples."""
+def samples_to(error: float, target: float, spp: int) -> float:
+    """Samples at which an error that falls by their root comes down to a target, `SOONEST` to `LATEST` times `spp`."""
+    return spp * min(max((error / target) ** 2, SOONEST), LATEST)
+
+
+def _with_error(found: Reference, denoise: Denoise, target: float) -> Reference:
+    """A render that knows the error of its denoised image, of now or of the samples before it may be at the target."""
     known = found.about.get(DENOISED)
-    if found.passes < 2 or (known and found.spp < DENOISED_AGAIN * known["spp"]):
+    if found.passes < FEWEST_PASSES or (known and found.spp < samples_to(found.error, target, known["spp"])):
         return found
     _, error, standard_error = cross_denoised(found, denoise)
     known = {"spp": found.spp, "error": error, "standard_error": standard_error}
