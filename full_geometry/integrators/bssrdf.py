@@ -81,7 +81,7 @@ def _class(variant: str) -> type:
 
         def prepare(self, scene: mi.Scene, samples: int = 1) -> list[TranslucentObject]:
             """The translucent objects of a scene, made ready once; ValueError if the scene cannot be rendered.
-            `samples`: of an image, by which corrected light has its walks; 0 for the light that is known."""
+            `samples`: of an image, by which corrected light has its walks; 0 for a first look."""
             with undisturbed(), dr.suspend_grad():
                 return self._checked(scene, samples)[0]
 
@@ -100,7 +100,7 @@ def _class(variant: str) -> type:
                 if light != "corrected":
                     check_sampled(scene)
                 if light in GATHERED_LIGHTS:
-                    objects = self.gathering.of(scene, objects, settings)
+                    objects = self.gathering.of(scene, objects, settings, quick=not samples)
             return objects, self.corrections.of(scene, objects, settings, samples) if light == "corrected" else None
 
         def take_over(self, other: mi.Integrator) -> None:
@@ -128,7 +128,8 @@ def _class(variant: str) -> type:
                 return sensor.film().develop() if develop else None
 
         def preview(self, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int) -> mi.TensorXf:
-            """The image without new walks for a correction of light: a first look at a scene that has changed."""
+            """The image without new walks for a correction of light, and by half of the light that is gathered: a first
+            look at a scene that has changed."""
             with interruptible(), undisturbed(), dr.suspend_grad():
                 self._render(scene, 0, sensor, seed, spp)
                 return sensor.film().develop()

@@ -29,7 +29,7 @@ from full_geometry.geometry.points import SurfacePoint, cosine_above, floats, of
 from full_geometry.geometry.rounding import blocked, ray_from
 from full_geometry.geometry.snapshot import Snapshot, same_objects
 from full_geometry.integrators.fine_light import fine_light
-from full_geometry.integrators.inner_light import COUNT, inner_light
+from full_geometry.integrators.inner_light import COUNT, UNEVEN, inner_light
 from full_geometry.integrators.lighting import EnvironmentMean, Lights
 from full_geometry.integrators.surface_paths import trace_paths
 from full_geometry.objects.objects import TranslucentObject
@@ -270,10 +270,14 @@ class Gathering:
         self._matrices: list[TransportMatrix | None] = []
         self._events: list[Events | None] = []
         self._light: Snapshot | None = None
+        self._parts = 0
         self._found: list[TranslucentObject] = []
 
-    def of(self, scene: mi.Scene, objects: list[TranslucentObject], settings: Settings) -> list[TranslucentObject]:
+    def of(
+        self, scene: mi.Scene, objects: list[TranslucentObject], settings: Settings, quick: bool = False
+    ) -> list[TranslucentObject]:
         """The objects, each with what leaves it in place of its transport.
+        `quick`: whether half of the light is enough where it is not known, as for a first look.
 
         Raises:
             ValueError: an object is open or has no known area, or light that arrives is not finite.
@@ -292,15 +296,15 @@ class Gathering:
             self._events = [Events.of(obj, COUNT) if one else None for obj, one in zip(objects, inner)]
             self._matrices, self._objects, self._light = made, objects, None
             self.seconds = (clock() - started, 0.0)
-        state = light_state(scene)
-        if state != self._light:
+        state, parts = light_state(scene), 1 if self._part or quick else 2
+        if state != self._light or parts > self._parts:
             # the light, in two parts that tell its noise
             checkpoint()
             started = clock()
-            seed, parts = 1000 * self._part + 10_000 * self._seed, 1 if self._part else 2
+            seed = 1000 * self._part + 10_000 * self._seed
             ways = list(zip(self._matrices, self._events))
             self._found = _lit(scene, objects, ways, settings, seed, parts)
-            self._light, self.seconds = state, (self.seconds[0], clock() - started)
+            self._light, self._parts, self.seconds = state, parts, (self.seconds[0], clock() - started)
         return self._found
 
     def kept(self, other: Gathering, k: int) -> float:
@@ -373,7 +377,7 @@ def _leaving(
     inner = None
     if events is not None:
         seen = floats(np.mean(others, axis=0))
-        inner = inner_light(scene, objects, k, settings, events, (T.points, seen))
+        inner = inner_light(scene, objects, k, settings, events, (T.points, seen), 1 if parts == 1 else UNEVEN)
 
     # ---- B = T (L - c) + c, c the mean of the environment where alpha is known
     mean = EnvironmentMean.of(scene, Lights.of(scene), [obj])

@@ -27,21 +27,22 @@ COUNT = 2**17  # events
 BRIGHTEST = 1 / 8192  # of the events, which are as bright as the next at most
 SHARING = 64  # groups of events beside each other
 SEED = 300
-UNEVEN = 3  # directions at an event under an environment that varies, else one
+UNEVEN = 3  # directions at an event under an environment that varies, but for a first look; else one
 SKYWARD = 0.75  # of the directions by the environment
 
 
 def inner_light(
     scene: mi.Scene, objects: list[TranslucentObject], k: int, settings: Settings, events: Events,
-    others: tuple[SurfacePoints, mi.Float],
+    others: tuple[SurfacePoints, mi.Float], uneven: int = UNEVEN,
 ) -> InnerLight:  # fmt: skip
     """J of object k.
     `scene`, `objects`, `settings`: what is rendered. `events`: of the object. `others`: points of its surface, and the
-    mean radiance of the other surfaces that each of them sees, by channel."""
+    mean radiance of the other surfaces that each of them sees, by channel. `uneven`: directions at an event under an
+    environment that varies."""
     # ---- n directions for each event, one lane each
     context, obj, count = RenderContext.of(scene, objects, settings, Primal()), objects[k], dr.width(events.p)
     sky = scene.environment()
-    n = 1 if sky is None or "Constant" in sky.class_name() else UNEVEN
+    n = 1 if sky is None or "Constant" in sky.class_name() else uneven
     lane, turn = dr.arange(mi.UInt32, n * count), np.random.default_rng(SEED + k).random(4)
     event = lane // dr.opaque(mi.UInt32, n)
     at = dr.gather(tuple, (events.p, events.n), event)

@@ -172,6 +172,17 @@ def test_light_is_gathered_anew_when_an_emitter_was_edited() -> None:
     assert "gathered at" in edited.integrator().gathered[0]
 
 
+def test_a_first_look_has_half_of_the_light_and_the_image_after_it_all() -> None:
+    scene = _scene("gathered", lights=_lights("lamp"))
+    integrator, sensor = scene.integrator(), scene.sensors()[0]
+    first = np.array(integrator.preview(scene, sensor, 0, 64), dtype=float)
+    known = len(integrator.prepare(scene, 0)[0].gathered.parts)
+    image, fresh = _image(scene), _image(_scene("gathered", lights=_lights("lamp")))
+    assert (known, len(integrator.prepare(scene, 0)[0].gathered.parts)) == (1, 2)
+    assert (image == fresh).all() and not (first == fresh).all()
+    assert first.mean() == pytest.approx(fresh.mean(), rel=0.02)
+
+
 def _refused(message: str, scene: Any) -> None:
     with pytest.raises((ValueError, RuntimeError), match=message):
         mi.render(scene, spp=1)
