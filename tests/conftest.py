@@ -52,8 +52,8 @@ LONGEST = (
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """Four at most: each takes up to 2 GB of memory."""
-    return max(2, min(backend.cores(), 4))
+    """One more than cores, as tests wait for processes that they start; four at most: each takes up to 2 GB."""
+    return max(2, min(backend.cores() + 1, 4))
 
 
 def pytest_configure(config: pytest.Config) -> None:
