@@ -93,20 +93,22 @@ def denoised(
 
 
 class Denoiser:
-    """A denoiser of renders of a scene, led by its albedo and normals without their noise.
+    """A denoiser of renders of a scene, led by its albedo and normals.
     `sensor`: of Mitsuba, or its number. `integrator`: that renders; None for the one of the scene. `spp`: samples of
-    albedo and normals. BackendError if the denoiser is not installed."""
+    albedo and normals. `clean`: whether these lose their noise first, which takes as long as two images. BackendError
+    if the denoiser is not installed."""
 
     def __init__(
         self, scene: mi.Scene, sensor: mi.Sensor | int = 0, integrator: mi.Integrator | None = None,
-        spp: int = GUIDE_SPP,
+        spp: int = GUIDE_SPP, clean: bool = True,
     ) -> None:  # fmt: skip
         check_denoiser()
-        albedo, normal = guides(scene, sensor, spp)
-        self._surface = np.any((albedo, normal), axis=(0, 3))
-        self._box = _box_around(self._surface)
-        named = ("albedo", albedo), ("normal", normal)
-        self._guides = [without_noise(name, guide[self._box]) for name, guide in named if self._surface.any()]
+        found = guides(scene, sensor, spp)
+        self._surface = np.any(found, axis=(0, 3))
+        self._box, self._clean = _box_around(self._surface), clean
+        self._guides = [guide[self._box] for guide in found if self._surface.any()]
+        if clean:
+            self._guides = [without_noise(*each) for each in zip(("albedo", "normal"), self._guides)]
         self._layered = bool(getattr(integrator or scene.integrator(), "layers", False))
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
@@ -119,7 +121,7 @@ class Denoiser:
         emission = np.clip(image[..., -3:], 0.0, light) if self._layered and image.shape[2] > 3 else 0.0
         rest = (light - emission).astype(np.float32)
         if self._guides:
-            found = denoised(rest[self._box], *self._guides, clean=True)[0]
+            found = denoised(rest[self._box], *self._guides, clean=self._clean)[0]
             rest[self._box] = np.where(self._surface[self._box][..., None], found, rest[self._box])
         return rest + emission
 

@@ -238,7 +238,7 @@ class LiveScene:
                 told = tuple(integrator.gathered) if is_bssrdf(integrator) else ()
             shown = mean.mean[..., :3]
             if way.denoise:
-                denoise = denoise or Denoiser(self.scene, sensor, integrator, GUIDE_SPP)
+                denoise = denoise or Denoiser(self.scene, sensor, integrator, GUIDE_SPP, clean=False)
                 shown = denoise(mean.mean)
             yield Shown(shown, mean.spp, mean.relative_error, ready + mean.seconds, ready, told)
             spp = 2 * spp if last < BRIEF and SHARE * 2 * spp <= mean.spp else spp
