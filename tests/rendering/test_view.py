@@ -116,6 +116,18 @@ def test_walks_keep_the_light_inside_while_the_camera_moves(live: LiveScene, mon
     assert filled[2:] == [translucent_walk.PREVIEW_RAYS]
 
 
+@pytest.mark.slow
+def test_a_denoised_look_is_smoother_than_the_noisy_one_where_surfaces_are(live: LiveScene) -> None:
+    pytest.importorskip("mitsuba_oidn")
+    live.apply(Edits())
+    camera, rough = live.camera(64), []
+    for denoise in (False, True):
+        image = _last(live, camera, Way("path_traced", "precomputed", denoise)).image
+        middle = image[tuple(slice(n // 3, 2 * n // 3) for n in image.shape[:2])]
+        rough.append(np.abs(np.diff(middle, axis=1)).mean())
+    assert 0 < rough[1] < 0.7 * rough[0]
+
+
 @pytest.mark.parametrize("medium", [{}, OWN, {"material": "ketchup"}], ids=["own", "numbers", "material"])
 def test_a_rough_boundary_has_the_index_of_its_medium(live: LiveScene, medium: dict[str, Any]) -> None:
     live.apply(Edits(media={"ball": {**medium, "roughness": 0.2}}))
