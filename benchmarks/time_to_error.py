@@ -2,8 +2,8 @@
 
 All counts: light inside, albedo and normals for the denoiser, passes, and all denoising.
 
-Passes grow. Whenever the samples have grown by what the last errors ask for, the halves are denoised and compared, as
-`full_geometry.scenes.reference` does, for pixels and for means over blocks of 8 x 8. No reference is
+Passes grow as those of `render` do. Whenever the samples have grown by what the last errors ask for, the halves are
+denoised and compared (`full_geometry.scenes.reference`), for pixels and for means over blocks of 8 x 8. No reference is
 rendered: the error is estimated without bias from the halves, but for the bias of precomputed light, below .3 %. The
 time of raw path tracing follows from its variance, and a lower bound of a denoised one that is given up from its error,
 which falls by the root of the samples at most. Ways are walks with precomputed light and Mitsuba's `volpathmis`.
@@ -25,11 +25,9 @@ from benchmarks.speeds import VOLUMES, LitObject
 from benchmarks.total_error import BLOCK, PRECOMPUTED, image_of_pass, lit_scene
 from figures.computing.scans import prepare
 from figures.parts.part import Row
-from full_geometry.scenes.reference import FEWEST_PASSES, Denoise, MixedHalves, samples_to
+from full_geometry.scenes.reference import FEWEST_PASSES, Denoise, Limits, MixedHalves, samples_to
 from full_geometry.scenes.reference_store import Reference
 from full_geometry.trade.denoising import Denoiser
-
-SHARE, LARGEST_PASS = 4, 64  # of passes, as `render` takes them
 
 
 @dataclass(frozen=True)
@@ -74,9 +72,9 @@ def _row(case: LitObject, way: str, how: ErrorsWanted, folder: Path) -> Row:
     scene, started, seed = lit_scene(case, way, how.size, folder), time.process_time(), how.seed + 1
     denoise = _denoiser(scene)
     found, wanted, most = None, 0.0, how.most if way == PRECOMPUTED else how.volume
+    passes = Limits(seconds=most)
     while True:
-        done = found.spp if found else 0
-        spp = min(2 ** (max(done // SHARE, 1).bit_length() - 1), LARGEST_PASS)
+        spp = passes.next_spp(found)
         image = image_of_pass(scene, spp, seed)
         found = (found or Reference.empty(image.shape, {}, halves=True)).add(image, spp, 0.0)
         seconds, seed = time.process_time() - started, seed + 1

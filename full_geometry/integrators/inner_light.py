@@ -33,7 +33,7 @@ SKYWARD = 0.75  # of the directions by the environment
 
 def inner_light(
     scene: mi.Scene, objects: list[TranslucentObject], k: int, settings: Settings, events: Events,
-    others: tuple[SurfacePoints, mi.Float], uneven: int = UNEVEN,
+    others: tuple[SurfacePoints, mi.Float], uneven: int,
 ) -> InnerLight:  # fmt: skip
     """J of object k.
     `scene`, `objects`, `settings`: what is rendered. `events`: of the object. `others`: points of its surface, and the

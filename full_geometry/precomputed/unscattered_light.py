@@ -439,6 +439,7 @@ class _Rays:
         parts = math.ceil(rays / AT_ONCE)
         for part in range(parts):
             checkpoint()
+            # paths of scattered light have the seeds that end in 1 and 2
             start = self.enter(k, math.ceil(rays / parts), parts, (seed, k, part, 3))
             dr.while_loop((start,), lambda ray: ray.alive, lambda ray: (self.segment(ray),), label="rays of light")
             dr.eval(self.D, self.w)

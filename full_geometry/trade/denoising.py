@@ -106,7 +106,7 @@ class Denoiser:
         found = guides(scene, sensor, spp)
         self._surface = np.any(found, axis=(0, 3))
         self._box, self._clean = _box_around(self._surface), clean
-        self._guides = [guide[self._box] for guide in found if self._surface.any()]
+        self._guides = [guide[self._box] for guide in found]
         if clean:
             self._guides = [without_noise(*each) for each in zip(("albedo", "normal"), self._guides)]
         self._layered = bool(getattr(integrator or scene.integrator(), "layers", False))
@@ -120,14 +120,13 @@ class Denoiser:
         light = np.maximum(image[..., :3] if image.shape[2] >= 3 else image[..., :1].repeat(3, axis=2), 0.0)
         emission = np.clip(image[..., -3:], 0.0, light) if self._layered and image.shape[2] > 3 else 0.0
         rest = (light - emission).astype(np.float32)
-        if self._guides:
-            found = denoised(rest[self._box], *self._guides, clean=self._clean)[0]
-            rest[self._box] = np.where(self._surface[self._box][..., None], found, rest[self._box])
+        found = denoised(rest[self._box], *self._guides, clean=self._clean)[0]
+        rest[self._box] = np.where(self._surface[self._box][..., None], found, rest[self._box])
         return rest + emission
 
 
 def _box_around(surface: np.ndarray) -> tuple[slice, slice]:
-    """Rows and columns of the pixels that show a surface, and `MARGIN` more on each side."""
+    """Rows and columns of the pixels that show a surface, and `MARGIN` more on each side; a corner where none does."""
     found = []
     for axis in (1, 0):
         lit = np.flatnonzero(surface.any(axis=axis))
