@@ -34,8 +34,6 @@ A `Part` is a name, parameters ready for JSON, a function and its estimated work
 
 from __future__ import annotations
 
-from importlib.metadata import entry_points
-
 __all__ = ["FIGURES", "figure_modules"]
 
 FIGURES = ("fig05", "fig06", "fig09", "fig10", "fig12")
@@ -45,6 +43,8 @@ ADDED: dict[str, str] = {}  # name -> module of figures that a program adds, as 
 
 def figure_modules() -> dict[str, str]:
     """The module of each figure by its name, those of other packages last; a name that is taken is not given anew."""
+    from importlib.metadata import entry_points  # 60 ms in which the command would not hear Ctrl-C yet
+
     added = {entry.name: entry.value for entry in entry_points(group=GROUP)} | ADDED
     own = {name: f"figures.{name}" for name in FIGURES}
     return own | {name: module for name, module in added.items() if name not in own}

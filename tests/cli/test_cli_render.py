@@ -285,7 +285,8 @@ def test_light_met_by_chance_is_told_in_a_sentence_where_it_is_a_share_of_noise_
 )
 def test_an_interrupt_at_any_moment_ends_with_130_and_one_line(model: str, after: float, scene: Path) -> None:
     run = [*START, "render", str(scene), "--model", model, "--spp", "1e7", "--out", str(scene.parent / "out")]
-    process = subprocess.Popen([run[0], "-c", "print('ready', flush=True); " + run[2], *run[3:]],
+    code = run[2].replace("main()", "print('ready', flush=True); main()")  # before, Python itself listens
+    process = subprocess.Popen([run[0], "-c", code, *run[3:]],
                                stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)  # fmt: skip
     assert process.stdout.readline() == "ready\n"
     time.sleep(0.1 + after)

@@ -67,7 +67,7 @@ def toy(monkeypatch: pytest.MonkeyPatch) -> Toy:
 def test_another_package_adds_a_figure_by_an_entry_point(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(figures, "FIGURES", ("fig10",))
     offers = [EntryPoint("ours", "figures.toy", figures.GROUP), EntryPoint("fig10", "figures.toy", figures.GROUP)]
-    monkeypatch.setattr(figures, "entry_points", lambda group: offers)
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: offers)
     assert figure("ours") is toy
     assert figure("fig10").__name__ == "figures.fig10"
 
