@@ -20,6 +20,7 @@ from figures.computing.learnt import weight_files
 from figures.computing.scans import prepare
 from figures.drawing.image_grid import image_files, rows_of
 from figures.parts.part import Part, Result, Task
+from full_geometry.trade.denoising import Denoiser
 from full_geometry.trade.image_differences import srgb
 from halfspace_sss.materials import load
 
@@ -31,8 +32,8 @@ SIZES = {"draft": 96, "paper": 384}
 MODEL_SPP = {"draft": 16, "paper": 64}
 TRUTH_SPP = {"draft": 64, "paper": 128}
 NOTES = (
-    "Corrected light has the time of its walks in its seconds; FLIP and relative squared error are of the pixels with "
-    f"something in them. {NOTE}"
+    "Corrected light has the time of its walks and of the denoiser in its seconds; FLIP and relative squared error are "
+    f"of the pixels with something in them. {NOTE}"
 )
 
 
@@ -59,7 +60,7 @@ def path_traced(task: Task) -> dict[str, object]:
 
 
 def corrected(task: Task) -> dict[str, object]:
-    """The image by corrected light."""
+    """The image by corrected light, denoised."""
     import mitsuba as mi
 
     from full_geometry.scenes.scene_files import load_scene
@@ -67,9 +68,11 @@ def corrected(task: Task) -> dict[str, object]:
     prepare()
     p = task.params
     for spp in (COMPILING, p["spp"]):
-        scene = load_scene(_file(task), p["model"], parameters=_size(task), settings={"light": "corrected"})
+        settings = {"light": "corrected", "layers": True}
+        scene = load_scene(_file(task), p["model"], parameters=_size(task), settings=settings)
         began = time.process_time()
-        image = np.array(mi.render(scene, spp=spp, seed=p["seed"] + 1))[..., :3]
+        image = np.array(mi.render(scene, spp=spp, seed=p["seed"] + 1))
+        image = Denoiser(scene)(image)
     return {"image": image.astype(np.float32), "spp": p["spp"], "CPU s": time.process_time() - began}
 
 

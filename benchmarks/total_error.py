@@ -30,8 +30,9 @@ from figures.computing.scans import prepare
 from figures.parts.part import Row
 from full_geometry.geometry.sensors import sampled_size
 from full_geometry.scenes.reference import Denoise, MixedHalves
-from full_geometry.scenes.reference_store import LIGHT, Reference
+from full_geometry.scenes.reference_store import CHANNELS, LIGHT, Reference
 from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
+from full_geometry.settings import LAYER
 from full_geometry.trade.denoising import Denoiser, cover
 
 SAMPLED, PRECOMPUTED = "walk, light sampled", "walk, light precomputed"
@@ -99,7 +100,7 @@ def lit_scene(case: LitObject, way: str, size: int, folder: Path) -> mi.Scene | 
     if way in VOLUMES:
         return ready(way, found, case.key, case.medium)
     if way == CORRECTED:
-        return load_scene(found, MODEL, settings={"light": "corrected"})
+        return load_scene(found, MODEL, settings={"light": "corrected", "layers": True})
     kind = "sampled" if way == SAMPLED else "precomputed"
     return load_scene(found, PATH_TRACED, settings={"light": kind, "layers": True})
 
@@ -153,12 +154,14 @@ def _results(found: Reference, denoise: Denoise, inside: np.ndarray) -> list[tup
     squared, noise = (x[inside].sum() for x in mixed.squared())
     whole = max(np.square(raw[inside]).sum() - variance, 1e-30)
     each = (raw, variance), (0.5 * (mixed.P + mixed.Q), max(squared, noise))
-    return [(image, float(np.hypot(np.sqrt(off / whole), found.light_error))) for image, off in each]
+    light = found.light_error * found.share_of_interior(inside)
+    return [(image, float(np.hypot(np.sqrt(off / whole), light))) for image, off in each]
 
 
 def _averaged(images: np.ndarray, spp: int, light: float = 0.0) -> Reference:
     """The mean of passes, with that of half of them, and the error of the light that they share."""
-    result = Reference.empty(images.shape[1:], {LIGHT: {"error": light}}, halves=True)
+    names = ["R", "G", "B", *LAYER]
+    result = Reference.empty(images.shape[1:], {LIGHT: {"error": light}, CHANNELS: names}, halves=True)
     for image in images:
         result = result.add(image, spp, 0.0)
     return result

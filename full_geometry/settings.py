@@ -7,7 +7,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from halfspace_sss.checks import check_choice, check_count, check_interval
+from halfspace_sss.checks import check_choice, check_count, check_flag, check_interval
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -18,6 +18,7 @@ ORDERS = ("total", "multiple", "single")
 LIGHTS = ("sampled", "gathered", "corrected", "auto")
 GATHERED_LIGHTS = ("gathered", "corrected")  # found once, before the first sample
 WALK_LIGHTS = ("auto", "precomputed", "sampled")  # of `translucent_walk`
+LAYER = ["emission.R", "emission.G", "emission.B"]  # channels of emission that the camera sees
 SHARED = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters")  # what `translucent_walk` understands too
 OF_MODELS = ("area_share", "entries")
 
@@ -41,6 +42,8 @@ class Settings:
             the tolerance, by measurement.
         hide_emitters: whether directly visible emitters are left out.
         tolerance: relative error of the radiance of an object that its model "auto" keeps; see `trade.automatic`.
+        layers: whether images have the layer `emission`, what the camera sees of emitters, at once or in the mirror of
+            an object; of light that is "corrected" alone.
         model, orders: of all objects, instead of what their surfaces say, where they are given.
     """
 
@@ -52,6 +55,7 @@ class Settings:
     hide_emitters: bool = False
     light: str = "sampled"
     tolerance: float = 0.05
+    layers: bool = False
     model: str = ""
     orders: str = ""
 
@@ -63,6 +67,9 @@ class Settings:
         check_depth("entries", self.entries)
         check_choice("light", self.light, LIGHTS)
         check_choice("orders", self.orders, ("", *ORDERS))
+        check_flag("layers", self.layers)
+        if self.layers and self.light != "corrected":
+            raise ValueError(f"layers must be false where light is not corrected, got true with {self.light}")
         if self.area_share != AUTOMATIC:
             check_interval("area_share", self.area_share, 0.0, 1.0)
 

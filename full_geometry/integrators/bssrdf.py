@@ -32,7 +32,7 @@ from full_geometry.integrators.surface_paths import replay_paths, trace_paths
 from full_geometry.objects.inclusions import check_sensors
 from full_geometry.objects.objects import KnowsUnit, TranslucentObject
 from full_geometry.objects.small_emitters import check_emitters, check_sampled
-from full_geometry.settings import GATHERED_LIGHTS, Choices, Settings, read_settings
+from full_geometry.settings import GATHERED_LIGHTS, LAYER, Choices, Settings, read_settings
 from full_geometry.surface.translucent import is_translucent
 from full_geometry.surface.wrapped import wraps
 from full_geometry.transport.prepare import Chooser, TranslucentObjects, choices_of, make_objects
@@ -221,6 +221,14 @@ def _class(variant: str) -> type:
         def unconnected(self) -> float:
             """Squares of light of orders 0 and 1 that phase sampling alone hits, summed over the samples."""
             return float(self._unconnected[0])
+
+        @property
+        def layers(self) -> bool:
+            """Whether images have the layer of emission."""
+            return self.settings.layers
+
+        def aov_names(self) -> list[str]:
+            return LAYER if self.layers else []
 
         @property
         def gathered(self) -> list[str]:

@@ -168,7 +168,7 @@ class Corrections:
     def walk(self, settings: Settings) -> mi.Integrator:
         """The integrator of the walks."""
         if self._walk is None:
-            self._walk = mi.load_dict({"type": "translucent_walk", **settings.shared()})
+            self._walk = mi.load_dict({"type": "translucent_walk", **settings.shared(), "layers": settings.layers})
             self._walk.ends = True
         return self._walk
 
@@ -242,7 +242,7 @@ class Corrections:
             walk.outgoing = None
             samples = max(SAMPLES_OF_LIGHT * number, FEWEST_OF_LIGHT)
             tracer = walk.tracer(scene, SEED, ImageSamples(samples, FEWEST_POINTS))
-            tracer = replace(tracer, visitor=replace(tracer.visitor, deep=True))
+            tracer = replace(tracer, visitor=replace(tracer.visitor, deep=True), layers=False)
             for k in missing:
                 known, light = self._known[k], self._lights[k]
                 first, halves = (known.launches, list(known.halves)) if known else (0, _nothing(light))

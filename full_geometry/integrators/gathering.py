@@ -588,7 +588,8 @@ def by_cosine(
     # the path loop goes on from the surface, where emission has been counted
     scene, objects, settings = scenery
     met, a, w, ray, si = met_by_cosine(scene, objects[0].instance_scene, albedo, at, u)
-    hidden = replace(settings, hide_emitters=True, light="sampled", max_depth=max(settings.max_depth - 1, -1) or 1)
+    depth = max(settings.max_depth - 1, -1) or 1
+    hidden = replace(settings, hide_emitters=True, light="sampled", layers=False, max_depth=depth)
     on = si.is_valid() & traced
     parts, *_ = trace_paths(scene, objects, hidden, sampler, ray, on, scattered=True)
     return met, dr.select(on, a * (parts[0] + parts[1]), 0), a, w, on

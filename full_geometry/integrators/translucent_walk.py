@@ -37,7 +37,7 @@ from full_geometry.precomputed.unscattered_light import (
     obstacle,
     unscattered_light,
 )
-from full_geometry.settings import MM_PER_UNIT, OF_MITSUBA, WALK_LIGHTS, check_depth, check_parameters
+from full_geometry.settings import LAYER, MM_PER_UNIT, OF_MITSUBA, WALK_LIGHTS, check_depth, check_parameters
 from full_geometry.surface.textured import shown
 from full_geometry.surface.varying import equivalent
 from full_geometry.surface.wrapped import surface_of
@@ -53,7 +53,6 @@ from halfspace_sss.interrupts import checkpoint, interruptible
 SUN = 0.02  # radians, below which what a clear object shows of an emitter after reflections is fireflies
 PARAMETERS = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters", "connection_share", "blur", "light", "layers")
 SAMPLES_PER_LAUNCH = 2**19
-LAYER = ["emission.R", "emission.G", "emission.B"]
 FEWEST_RAYS = 2**16  # of light, for each object
 PREVIEW_RAYS = 2**14  # of a first look at light that has changed
 FOREVER, DEPTHS = 2**31 - 1, {"max_depth": -1, "rr_depth": 5}

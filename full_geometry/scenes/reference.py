@@ -341,8 +341,9 @@ def _pass(start: Reference, scene: mi.Scene, integrator: mi.Integrator, limits: 
         return result
     made = integrator.corrections
     if made.error is not None:
-        error = (start.light_error * start.spp + made.error * spp) / result.spp
-        light = {"error": float(f"{error:.6g}"), "now": float(f"{made.error:.6g}")}
+        now = made.error * result.share_of_interior()
+        error = (start.light_error * start.spp + now * spp) / result.spp
+        light = {"error": float(f"{error:.6g}"), "now": float(f"{now:.6g}")}
         light |= {"samples": made.samples, "finest": made.finest}
         result = replace(result, about={**result.about, LIGHT: light})
     if mi.is_spectral:

@@ -20,13 +20,14 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.settings import LAYER
 from halfspace_sss.provenance import write_together
 
 FORMAT = "halfspace-sss reference 3"
 HEADER = "halfspace_sss"
 CHANNELS = "channels"  # their names
 DENOISED = "denoised"  # error of the denoised image, its standard error, and the samples that it is of
-LIGHT = "light"  # error of corrected light, the mean over samples and now; samples that have its walks; if it has all
+LIGHT = "light"  # error that corrected light makes, the mean over samples and now; samples that have its walks; if all
 BY_CHANCE = "squares_by_chance"  # of light that orders below two met by chance, summed over samples
 
 
@@ -88,8 +89,18 @@ class Reference:
 
     @property
     def light_error(self) -> float:
-        """The relative error of corrected light, which passes share, so that their spread does not show it."""
+        """The error of corrected light in the image, which passes share, so that their spread does not show it."""
         return self.about.get(LIGHT, {}).get("error", 0.0)
+
+    def share_of_interior(self, pixels: np.ndarray | slice = slice(None)) -> float:
+        """sqrt(sum (L - L_e)² / sum L²) over pixels: how much of an error of light from inside is one of the image.
+        L_e is the layer of emission; 1 without it."""
+        names = self.about.get(CHANNELS, [])
+        if names[:3] != ["R", "G", "B"] or names[-3:] != LAYER:
+            return 1.0
+        L, L_e, variance = (x[pixels] for x in (self.mean[..., :3], self.mean[..., -3:], self.variance[..., :3]))
+        whole = np.square(L).sum() - variance.sum()
+        return min(float(np.sqrt(np.square(L - L_e).sum() / whole)), 1.0) if whole > 0 else 1.0
 
     @property
     def error(self) -> float:

@@ -189,6 +189,8 @@ def open_scene(
     _choose_integrator(state, by_walks, not named, asked, settings or {})
     for plugin, given in zip(_INTEGRATORS.values(), _settings(settings or {})):
         _set_parameters(state, plugin, given)
+    layered = {"layers": True} if (settings or {}).get("layers") else {}
+    _set_parameters(state, "bssrdf", layered, lambda props: props.get("light") == "corrected")
     _set_parameters(state, "bitmap", {"format": "variant"} if floats else {})
     loaded = _made(scene, state, config)
     if not any(map(surface_of, loaded.shapes())):
@@ -203,9 +205,13 @@ def names_nothing(scene: dict[str, Any] | str | Path, parameters: Mapping[str, s
     return (is_gltf(scene) or not integrators) and not any("model" in props for props in _surfaces(state))
 
 
-def _set_parameters(state: ParserState, plugin: str, settings: Mapping[str, float | str]) -> None:
+def _set_parameters(
+    state: ParserState, plugin: str, settings: Mapping[str, float | str],
+    some: Callable[[mi.Properties], bool] = lambda props: True,
+) -> None:  # fmt: skip
+    """Set parameters of all nodes of a plugin, or of `some`."""
     for node in state.nodes if settings else ():
-        if node.props.plugin_name() == plugin:
+        if node.props.plugin_name() == plugin and some(node.props):
             for key, value in settings.items():
                 node.props[key] = value
 

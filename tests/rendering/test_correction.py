@@ -227,6 +227,31 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(correction, name, getattr(correction, name) // 8)
 
 
+def test_its_layer_of_emission_is_that_of_walks(few: None) -> None:
+    """The sky beside a ball and in its mirror; without it, the image is as without layers."""
+    scene, images = _scene("walk", MEDIUM, _lamp(), hidden=False), []
+    for plugin in ("translucent_walk", "bssrdf"):
+        light = {"light": "corrected"} if plugin == "bssrdf" else {}
+        for layers in (True, False):
+            integrator = mi.load_dict({"type": plugin, "mm_per_unit": 6.0, "layers": layers, **light})
+            images.append(np.array(mi.render(scene, integrator=integrator, spp=64), dtype=float))
+    walked, _, layered, alone = images
+    np.testing.assert_allclose(layered[..., :3], alone, rtol=1e-5)
+    assert layered[..., 3:].mean() > 0.1 * alone.mean()
+    np.testing.assert_allclose(layered[..., 3:], walked[..., 3:], rtol=1e-5)
+
+
+def test_its_error_in_an_image_is_that_of_the_part_that_is_no_emission(few: None, tmp_path: Path) -> None:
+    scene, found = _scene("walk", MEDIUM, _lamp(), hidden=False), {}
+    for layers in (True, False):
+        integrator = {"type": "bssrdf", "mm_per_unit": 6.0, "light": "corrected", "layers": layers}
+        found[layers] = reference.render(scene, tmp_path / f"{layers}.exr", integrator=integrator, spp=16)
+    L, L_e = found[True].mean[..., :3], found[True].mean[..., 3:]
+    share = np.sqrt(np.square(L - L_e).sum() / np.square(L).sum())
+    assert share < 0.9
+    assert found[True].light_error == pytest.approx(share * found[False].light_error, rel=0.02)
+
+
 @pytest.mark.slow
 def test_a_medium_that_is_black_in_two_channels_has_the_light_of_walks_in_the_other(few: None) -> None:
     red = {"sigma_t": 1.2, "albedo": "0.9,0,0", "eta": 1.4}

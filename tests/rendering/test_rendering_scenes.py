@@ -149,7 +149,9 @@ def test_a_scene_without_translucent_object_is_refused():
     refused("must have an object with a translucent BSDF", view(SPHERE))
 
 
-@pytest.mark.parametrize("settings", [{"mm_per_unit": 0.0}, {"area_share": 1.5}, {"max_depth": 0}, {"rr_depth": 0}])
+@pytest.mark.parametrize(
+    "settings", [{"mm_per_unit": 0.0}, {"area_share": 1.5}, {"max_depth": 0}, {"rr_depth": 0}, {"layers": 1}]
+)
 def test_settings_out_of_range_are_refused_by_name(settings):
     ((name, value),) = settings.items()  # Mitsuba names a setting that nobody reads, too
     refused(f"{name} must be .* got {value!r}", view({**SPHERE, "bsdf": surface()}, **settings))
