@@ -27,18 +27,25 @@ from halfspace_sss.arrays import aligned
 GLINT, GLINTS, CANDIDATES = 8.0, 128, 8  # least variance over the light, one of so many pixels at most, those looked at
 PLACES, MOST_PLACES, SHARE = 32, 1024, 4  # least and most in each, for a sample; one for so many samples of the image
 NEAR = 1.5  # steps from pixel to pixel, within which what they mirror may be a rim
-FEWEST_TRIALS, TRIALS, TRIAL_RAYS = 2, 16, 4  # rays through each pixel that find them; through candidates, a pixel
+FEWEST_TRIALS, TRIALS, TRIAL_RAYS = 4, 16, 2  # rays through each pixel that find them; through candidates, a pixel
 LIT_RAYS = 2**13  # that tell the light
 SMALLEST = 0.01  # edge of a rectangle, pixels
+BRIGHTEST = 64.0  # times the RMS of the other light of objects and the mean of the emission seen in them
 
 
 class Glints(NamedTuple):
-    """Numbers of pixels, and in each the corners of a rectangle about small reflections, the whole where none is known,
-    from 0 to 1."""
+    """Pixels in which emission is asked for at many places.
+
+    Args:
+        pixels: their numbers.
+        low, high: corners of a rectangle about small reflections in each, the whole where none is known, from 0 to 1.
+        brightest: most that a path elsewhere finds of emitters where few paths meet them.
+    """
 
     pixels: mi.UInt32
     low: mi.Point2f
     high: mi.Point2f
+    brightest: mi.Float
 
 
 def glint_light(
@@ -50,11 +57,11 @@ def glint_light(
     each = PixelGrid.of(sensor).pixels // (SHARE * number)
     each = 2 ** (min(max(each, PLACES), MOST_PLACES).bit_length() - 2)
     pixel = dr.arange(mi.UInt32, number * spp * each) // dr.opaque(mi.UInt32, spp * each)
-    low, high = (dr.gather(mi.Point2f, v, pixel) for v in glints[1:])
+    low, high = (dr.gather(mi.Point2f, v, pixel) for v in glints[1:3])
     area, result = (high.x - low.x) * (high.y - low.y), mi.Spectrum(0)
     whole = dr.zeros(mi.Point2f, number), dr.full(mi.Point2f, 1, number)
     dr.make_opaque(whole)
-    for half, rectangles in enumerate((whole, glints[1:])):
+    for half, rectangles in enumerate((whole, glints[1:3])):
         # ---- places uniform in the pixel, or in its rectangle
         numbers = path_numbers(seeded(seed, 1 + half), number, first * each, spp * each)
         a, b = (dr.gather(mi.Point2f, v, pixel) for v in rectangles)
@@ -72,7 +79,7 @@ def glints_of(tracer: PathTracer, sensor: mi.Sensor, trial: int) -> Glints:
     `trial`: rays of each pixel that look for it."""
     film = PixelGrid.of(sensor)
     near, most = _near_mirrored(tracer, sensor, film), film.pixels // GLINTS
-    pixels, least = dr.arange(mi.UInt32, film.pixels), np.inf
+    pixels, other, brightest = dr.arange(mi.UInt32, film.pixels), np.inf, np.inf
     dr.make_opaque(pixels)
     # of all pixels by few rays those about which it varies most, or may; of these by more rays
     for first, wide, kept in ((True, 5, CANDIDATES * most), (False, 3, most)):
@@ -82,8 +89,11 @@ def glints_of(tracer: PathTracer, sensor: mi.Sensor, trial: int) -> Glints:
         places, weight = _rays(tracer, sensor, numbers, pixels)
         light = mi.Spectrum(weight * tracer.seen_emission(places))
         dr.eval(light)
-        if first and (dr.any(dr.max(light) > 0) or dr.any(near)):  # else no other light is asked for
-            least = GLINT * _other_light(tracer, sensor, film)
+        # else no other light is asked for
+        if first and (tracer.visitor.small is not None or dr.any(dr.max(light) > 0)):
+            other, share = _other_light(tracer, sensor, film)
+            mirrored = np.linalg.norm([float(dr.mean(v)[0]) for v in light]) / max(share, 1 / LIT_RAYS)
+            brightest = BRIGHTEST * (np.sqrt(other) + mirrored) or np.inf
         # Σ_c E[L_c²] - E[L_c]², by the pixels about each
         light = [mi.Float64(v) for v in light]
         moments = [*light, sum(v * v for v in light)]
@@ -92,7 +102,7 @@ def glints_of(tracer: PathTracer, sensor: mi.Sensor, trial: int) -> Glints:
         variance = square - sum(mean * mean for mean in means)
         if first:
             variance = dr.select(near, dr.inf, variance)
-        pixels = _largest(variance, least, kept)
+        pixels = _largest(variance, GLINT * other, kept)
         if dr.width(pixels) == 0:
             break
     # with those that faces tell of
@@ -101,7 +111,8 @@ def glints_of(tracer: PathTracer, sensor: mi.Sensor, trial: int) -> Glints:
     low, high = np.zeros((len(found), 2)), np.ones((len(found), 2))
     at = np.searchsorted(found, on_faces)
     low[at], high[at] = corners
-    return Glints(aligned(mi.UInt32, found), of_rows(mi.Point2f, low), of_rows(mi.Point2f, high))
+    corners = of_rows(mi.Point2f, low), of_rows(mi.Point2f, high)
+    return Glints(aligned(mi.UInt32, found), *corners, dr.opaque(mi.Float, float(brightest)))
 
 
 def _rays(
@@ -205,11 +216,12 @@ def _near_mirrored(tracer: PathTracer, sensor: mi.Sensor, film: PixelGrid) -> mi
     return result
 
 
-def _other_light(tracer: PathTracer, sensor: mi.Sensor, film: PixelGrid) -> float:
-    """The mean square of the light of objects without the emission seen in them."""
+def _other_light(tracer: PathTracer, sensor: mi.Sensor, film: PixelGrid) -> tuple[float, float]:
+    """The mean square of the light of objects without the emission seen in them, and the share of rays with any."""
     pixels = aligned(mi.UInt32, np.linspace(0, film.pixels - 1, LIT_RAYS).astype(np.uint32))
     rays, weight = _rays(tracer, sensor, path_numbers(seeded(0, 2), LIT_RAYS, 0, 1), pixels)
     apart = dr.opaque(mi.Bool, True, LIT_RAYS)
-    L, hit, _ = replace(tracer, apart=apart).trace(rays, on_device(PATH_LANES), (0, 2))
+    tracer = replace(tracer, apart=apart, brightest=dr.opaque(mi.Float, np.inf))  # the kernel of the image
+    L, hit, _ = tracer.trace(rays, on_device(PATH_LANES), (0, 2))
     light = np.array(weight * L, dtype=float)[:, np.array(hit)]
-    return float((light**2).sum() / max(light.shape[1], 1))
+    return float((light**2).sum() / max(light.shape[1], 1)), light.shape[1] / LIT_RAYS

@@ -12,7 +12,7 @@ from full_geometry.objects.small_emitters import SmallEmitters
 from full_geometry.precomputed.lit_points import to_world
 from full_geometry.walk.media import WalkMedia
 
-TINY = 1 / 16  # pixels of a reflection that rays through pixels and their neighbours miss
+TINY = 1 / 4  # pixels of a reflection that rays through pixels and their neighbours miss
 CURVED, LEVELS = 0.2, 9  # part of the spread of mirrored directions of a face that is not linear; times it is divided
 CLEAR = 1e-3  # of the way to the camera, which begins so far off a face and ends so far before the camera
 AT_ONCE = 2**16  # faces

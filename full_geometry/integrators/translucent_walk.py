@@ -438,7 +438,7 @@ def _launch(
             lanes = dr.gather(mi.UInt32, glints.pixels, lanes // spp) * spp + lanes % spp
             dr.scatter(apart, True, lanes)
         dr.eval(apart)
-        tracer = replace(tracer, apart=apart)
+        tracer = replace(tracer, apart=apart, brightest=glints.brightest)
     L, seen, emission = tracer.trace(rays, on_device(PATH_LANES), seed, exits)
     if keep:
         keep(exits)

@@ -132,6 +132,7 @@ class CameraPath:
     mirrored: mi.Bool  # whether it has met mirrors of objects alone, all from outside
     stay: Stay | tuple[()] = ()  # inside an object, where derivatives are asked for
     emission: mi.Spectrum | tuple[()] = ()  # seen at once or in the mirror of what is met first, if asked for
+    passed: mi.Bool | tuple[()] = ()  # whether it has been inside an object, see `_cut`
 
 
 # ---- Light gathered along a path -------------------------------------------------------------------------------------
@@ -688,6 +689,7 @@ class PathTracer:
         layers: whether emission that the camera sees, at once or in the mirror of an object, is also told apart.
         apart: by the number of a ray, whether light is without its `seen_emission`.
         within: glass that is around all rays where they begin, see `walk.priorities`.
+        brightest: most that a path finds of emitters where few paths meet them, see `_cut`.
     """
 
     visitor: LightVisitor
@@ -697,6 +699,7 @@ class PathTracer:
     layers: bool = False
     apart: mi.Bool | None = None
     within: int = 0
+    brightest: mi.Float | None = None
 
     def trace(
         self,
@@ -728,6 +731,7 @@ class PathTracer:
                 path.walk.within = dr.opaque(mi.UInt32, self.within, dr.width(index))
             if self.visitor.sees_through and exits is None:  # of all orders, the lowest too
                 path.walk.kept = dr.full(mi.Spectrum, 1, dr.width(index))
+            path.passed = () if self.brightest is None else dr.full(mi.Bool, False, dr.width(index))
             return replace(path, emission=dr.zeros(mi.Spectrum, dr.width(index))) if self.layers else path
 
         # inside: a free flight, with what is recorded beside the light
@@ -736,7 +740,8 @@ class PathTracer:
             record = StayRecord(p.light, p.index, p.stay) if scores else record
             walk, record = walker.step(p.walk, record)
             stay = record.stay if scores else ()
-            return replace(p, walk=walk, light=record.record if exits or scores else record, stay=stay)
+            light = record.record if exits or scores else record
+            return replace(p, walk=walk, light=light, stay=stay, passed=self._passed(p.passed, walk))
 
         def end_stay(p: CameraPath) -> CameraPath:
             record = scorer.end(StayRecord(p.light, p.index, p.stay))
@@ -815,7 +820,7 @@ class PathTracer:
         # ---- emission: L += throughput L_e p_f / (p_f + p_e)
         first = p.depth == 0
         shown = ~first if self.hide_emitters else mi.Bool(True)
-        L_e = self.visitor.met_emitter(p.walk, p.light, si, shown)
+        L_e = self._cut(self.visitor.met_emitter(p.walk, p.light, si, shown), p)
         if self.layers:
             p = replace(p, emission=p.emission + dr.select(first, L_e, 0))
         L = p.light.L + L_e
@@ -930,14 +935,15 @@ class PathTracer:
         small = self.visitor.small
         active = active & ~p.light.scattered if small is not None and small.n_delta else active
         mirrored, behind = self.visitor.seen_emitters(p.walk, si, bsdf, k, active)
-        light, first = mirrored.light + behind.light, p.depth == 1
+        light, first = self._cut(mirrored.light + behind.light, p), p.depth == 1
 
         # ---- the first surface finds what mirrors show in its mirror, so that they must not
         if self.visitor.unscattered is not None:
             meets = first & mirrored.found & (dr.min(mirrored.kept) == 1)
             walk, meets = _along_mirror(self.visitor.media, p.walk, si, bsdf, meets)
-            state = (light, walk, meets)
-            light, _, _ = dr.if_stmt(state, meets, self._in_mirror, lambda *state: state, label="mirrors")
+            state = (mi.Spectrum(0), walk, meets)
+            found, _, _ = dr.if_stmt(state, meets, self._in_mirror, lambda *state: state, label="mirrors")
+            light = light + self._cut(found, replace(p, depth=mi.UInt32(MIRRORS)))
             light = dr.select(p.mirrored & ~first & (p.depth <= MIRRORS), 0, light)
         if self.apart is not None:
             light = dr.select(first & dr.gather(mi.Bool, self.apart, p.index), 0, light)
@@ -947,6 +953,20 @@ class PathTracer:
 
     def _in_mirror(self, light: mi.Spectrum, walk: Walk, active: mi.Bool) -> tuple:
         return light + self._mirrored(walk, active, MIRRORS - 1), walk, active
+
+    def _passed(self, before: mi.Bool | tuple[()], walk: Walk) -> mi.Bool | tuple[()]:
+        """Whether a path has been inside an object, and scattered there where light passes clear ones."""
+        if self.brightest is None:
+            return before
+        return before | (walk.order > 0 if self.visitor.unscattered.clear else True)
+
+    def _cut(self, light: mi.Spectrum, p: CameraPath) -> mi.Spectrum:
+        """Light of emitters at most as bright as `brightest`, in its own colour, where few paths meet small ones: once
+        a path has come out of an object, or two have mirrored it."""
+        if self.brightest is None:
+            return light
+        rare = p.passed | (p.mirrored & (p.depth >= MIRRORS))
+        return dr.select(rare, light * dr.minimum(1, self.brightest / dr.maximum(dr.max(light), 1e-30)), light)
 
 
 def _along_mirror(

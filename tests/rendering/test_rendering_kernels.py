@@ -135,7 +135,7 @@ def test_glints_of_all_channels_are_traced_at_once_in_films_of_all_sizes():
         gc.collect()
         scene = _ball(np.random.default_rng(1), "precomputed", side)
         sensor, tracer = scene.sensors()[0], scene.integrator().tracer(scene, 0, ImageSamples(16, 16))
-        glints = Glints(mi.UInt32(1, 2), mi.Point2f(0, [0.2, 0.4]), mi.Point2f(1, [0.6, 0.8]))
+        glints = Glints(mi.UInt32(1, 2), mi.Point2f(0, [0.2, 0.4]), mi.Point2f(1, [0.6, 0.8]), mi.Float(1))
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True), dr.suspend_grad():
             dr.kernel_history_clear()
             dr.eval(glint_light(tracer, sensor, glints, 0, (0, 4)))

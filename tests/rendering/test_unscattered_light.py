@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -367,6 +368,28 @@ def test_the_mirror_image_of_a_lamp_that_fills_a_small_part_of_a_pixel_is_found(
     glint = image[row - 1 : row + 2, column - 1 : column + 2].sum() - 9 * np.median(image[image > 0])
     pixel = 2 * np.tan(np.radians(8)) * 38 / 64
     assert glint == pytest.approx(3 * 20 * 0.0293 * (0.4 * 2.5 / (29 + 2.5) / pixel) ** 2, rel=0.15)
+
+
+def test_light_of_small_emitters_that_few_paths_meet_is_cut_and_no_other() -> None:
+    """Of two balls under a lamp of .1 radians: a ray is as bright as without a cut, or was brighter than its bound."""
+    from full_geometry.precomputed.unscattered_light import ImageSamples
+
+    other = {**_ball(2.5, center=[2.5, 0, 0]), "bsdf": {"type": "translucent", **MEDIUM}}
+    light = _lamp(1.5)
+    light["emitter"]["radiance"] *= (6.0 / 1.5) ** 2
+    scene = _scene("precomputed", MEDIUM, _ball(2.5, center=[-2.5, 0, 0]), other=other, lamp=light)
+    places = np.random.default_rng(1).random((2, 2**18), dtype=np.float32)
+    rays, _ = scene.sensors()[0].sample_ray(0.0, 0.5, mi.Point2f(*map(mi.Float, places)), mi.Point2f(0.5))
+    tracer, images = scene.integrator().tracer(scene, 0, ImageSamples(2**14, 64)), []
+    for brightest in (np.inf, 0.2):
+        bound = replace(tracer, brightest=dr.opaque(mi.Float, brightest))
+        with dr.suspend_grad():
+            images.append(np.array(bound.trace(rays, 2**12, (1,))[0]))
+    whole, cut = images
+    differs = (whole != cut).any(axis=0)
+    assert differs.sum() > 3
+    assert (whole[:, differs].max(axis=0) > 0.2).all()
+    assert (cut <= whole).all()
 
 
 def _mesh_ball(folder: Path, rows: int = 64) -> str:
