@@ -33,7 +33,7 @@ from scipy.special import ndtr
 
 from full_geometry.geometry.sensors import seeded
 from full_geometry.objects.objects import translucent_shapes
-from full_geometry.trade.denoising import GUIDE_SPP, GUIDES, denoised, guides_of
+from full_geometry.trade.denoising import GUIDE_SPP, GUIDES, denoised, guides_of, without_noise
 from full_geometry.trade.images import film_of, pixel_means, pixels_of
 from full_geometry.trade.results import DOUBT, TechniqueTrade
 from full_geometry.trade.sampling import seen_through
@@ -125,8 +125,8 @@ def denoised_rows(
 
     # ---- the law of each object about the samples that keep the tolerance
     black = np.zeros((TIMED, TIMED, 3), dtype=np.float32)
-    # two halves are denoised, and guides take as long as one of them
-    of_image = 3 * denoised(black, black, black)[1] / black[..., 0].size * math.prod(film) / len(seen)
+    # two halves are denoised, two guides lose their noise, and these take as long as one of them
+    of_image = 5 * denoised(black, black, black, clean=True)[1] / black[..., 0].size * math.prod(film) / len(seen)
     rows: list[TechniqueTrade | None] = [None] * len(found)
     for k, n in zip(seen, ends):
         plain, e = found[k].row, laws[k].at(n)
@@ -151,7 +151,8 @@ class Tiles:
 
     Attributes:
         pixels: x and y of all (n, 2), row by row of each window.
-        guides: albedo and normals of the denoiser, (tiles, H, W, 6).
+        guides: albedo and normals of the denoiser without their noise, each (rows H, columns W, 3), side by side.
+        shape: tiles, H, W.
         weights: inverse densities of the pixels of each object that count, else 0, (tiles, H, W, objects).
         seen: how many pixels show each object.
         halves: means of the passes of each half, (passes, tiles, H, W, 3).
@@ -176,7 +177,8 @@ class Tiles:
         found = pixel_means(camera, film, pixels, GUIDE_SPP, seeded(seed, 61), _aovs_of(on.scene)).reshape(*shape, -1)
         near = sum(uniform_filter(p, SIDE - 2 * MARGIN, mode="constant") for p in densities)
         drawn = near[pixels[:, 1], pixels[:, 0]].reshape(*shape, 1)
-        self.guides, covered = found[..., :6], found[..., 6:] > 0
+        guides, covered = guides_of(_side_by_side(found[..., :6])), found[..., 6:] > 0
+        self.guides, self.shape = [without_noise(*each) for each in zip(("albedo", "normal"), guides)], shape
         self.weights, self.seen = covered / np.maximum(drawn, LEAST_DENSITY * drawn.max()), covered.sum(axis=(0, 1, 2))
         for tile, corner in zip(self.weights, corners):
             tile *= _inner(size, corner, film)[..., None]
@@ -185,15 +187,15 @@ class Tiles:
 
     def take(self, half: int, passes: np.ndarray, before: int, spp: int) -> None:
         """Add `spp` samples to the passes of a half, (passes, pixels, 3), of `before` samples so far."""
-        passes = passes.reshape(PASSES, *self.guides.shape[:3], 3)
+        passes = passes.reshape(PASSES, *self.shape, 3)
         self.halves[half] = (before * self.halves[half] + spp * passes) / (before + spp)
 
     def denoise(self, spp: int) -> None:
         """Denoise the first passes of each half, which have so many samples, all tiles side by side."""
-        guides = guides_of(_side_by_side(self.guides))
         for n in LEVELS:
             images = [_side_by_side(half[:n].mean(axis=0)) for half in self.halves]
-            self.parts.append((n * spp, [_apart(denoised(x, *guides)[0], self.guides.shape[:3]) for x in images]))
+            clean = [denoised(x, *self.guides, clean=True)[0] for x in images]
+            self.parts.append((n * spp, [_apart(x, self.shape) for x in clean]))
 
     def squares(self, k: int) -> tuple[np.ndarray, np.ndarray]:
         """Sums over blocks of object k, (2 parts, blocks), and their weights: squared differences of each part from the
