@@ -87,7 +87,7 @@ def glints_of(tracer: PathTracer, sensor: mi.Sensor, trial: int) -> Glints:
     `trial`: rays of each pixel that look for it."""
     film = PixelGrid.of(sensor)
     near = _near_mirrored(tracer, sensor, film)
-    most = max(film.pixels // GLINTS, min(film.pixels, SMALL_IMAGE // 4) // GLINTS_THERE)
+    most = max(film.pixels // GLINTS, min(film.pixels // GLINTS_THERE, SMALL_IMAGE // GLINTS))
     pixels, other, brightest = dr.arange(mi.UInt32, film.pixels), np.inf, np.inf
     dr.make_opaque(pixels)
     # of all pixels by few rays those about which it varies most, or may; of these by more rays
