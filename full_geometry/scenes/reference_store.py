@@ -104,7 +104,7 @@ class Reference:
 
     @property
     def error(self) -> float:
-        """What the image is off: its noise and `light_error`, as of an object that fills it."""
+        """What the image is off: its noise and `light_error`, without a layer of emission as if objects filled it."""
         return math.hypot(self.noise, self.light_error)
 
     @property

@@ -33,7 +33,7 @@ from scipy.special import ndtr
 
 from full_geometry.geometry.sensors import seeded
 from full_geometry.objects.objects import translucent_shapes
-from full_geometry.trade.denoising import GUIDE_SPP, GUIDES, denoised, guides_of, without_noise
+from full_geometry.trade.denoising import GUIDE_SPP, GUIDES, clean_guides, denoised, guides_of
 from full_geometry.trade.images import film_of, pixel_means, pixels_of
 from full_geometry.trade.results import DOUBT, TechniqueTrade
 from full_geometry.trade.sampling import seen_through
@@ -177,8 +177,8 @@ class Tiles:
         found = pixel_means(camera, film, pixels, GUIDE_SPP, seeded(seed, 61), _aovs_of(on.scene)).reshape(*shape, -1)
         near = sum(uniform_filter(p, SIDE - 2 * MARGIN, mode="constant") for p in densities)
         drawn = near[pixels[:, 1], pixels[:, 0]].reshape(*shape, 1)
-        guides, covered = guides_of(_side_by_side(found[..., :6])), found[..., 6:] > 0
-        self.guides, self.shape = [without_noise(*each) for each in zip(("albedo", "normal"), guides)], shape
+        self.guides, self.shape = clean_guides(guides_of(_side_by_side(found[..., :6]))), shape
+        covered = found[..., 6:] > 0
         self.weights, self.seen = covered / np.maximum(drawn, LEAST_DENSITY * drawn.max()), covered.sum(axis=(0, 1, 2))
         for tile, corner in zip(self.weights, corners):
             tile *= _inner(size, corner, film)[..., None]

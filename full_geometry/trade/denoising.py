@@ -66,6 +66,11 @@ def without_noise(name: str, guide: np.ndarray) -> np.ndarray:
     return result
 
 
+def clean_guides(found: tuple[np.ndarray, np.ndarray]) -> list[np.ndarray]:
+    """Albedo and normals without their noise."""
+    return [without_noise(*each) for each in zip(("albedo", "normal"), found)]
+
+
 def denoised(
     image: np.ndarray, albedo: np.ndarray, normal: np.ndarray, clean: bool = False
 ) -> tuple[np.ndarray, float]:
@@ -106,9 +111,8 @@ class Denoiser:
         found = guides(scene, sensor, spp)
         self._surface = np.any(found, axis=(0, 3))
         self._box, self._clean = _box_around(self._surface), clean
-        self._guides = [guide[self._box] for guide in found]
-        if clean:
-            self._guides = [without_noise(*each) for each in zip(("albedo", "normal"), self._guides)]
+        boxed = tuple(guide[self._box] for guide in found)
+        self._guides = clean_guides(boxed) if clean else boxed
         self._layered = bool(getattr(integrator or scene.integrator(), "layers", False))
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
