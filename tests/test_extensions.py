@@ -106,6 +106,7 @@ BROKEN = {
 CODE = "number = 3\ndef draw(result):\n    pass\ndef odd(x: list[list[int]]):\n    pass\n"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arguments", [["models"], ["materials", "list"], QUICK], ids=lambda a: a[0])
 def test_no_command_falls_with_a_broken_package(tmp_path: Path, arguments: list[str]) -> None:
     env = _install(tmp_path, CODE, *BROKEN.values())

@@ -90,6 +90,7 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[list[str], 
     return {page: (printed, error) for page, printed, error in rows}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", SNIPPETS)
 def test_snippets_run_and_print(page: str, ran: dict[str, tuple[list[str], str]]) -> None:
     printed, error = ran[page]

@@ -16,6 +16,7 @@ from figures.computing.images import Shot
 from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, training_of, weight_files, with_weights
 from figures.computing.scans import environment, environment_file, prepare
 from figures.parts.part import Part, Result, SceneDict, Task
+from full_geometry.trade.denoising import Denoiser
 
 TITLE = "candle with its flame, mandarin and croissant, path traced and by models, light gathered and corrected"
 OBJECTS = ("candle", "mandarin", "croissant")
@@ -29,7 +30,7 @@ LIGHT = "sunset"  # the small lamps of the studio are hardly found by walks
 NOTES = (
     "The candle is homogeneous wax with its flame as a small emitter in the bowl; mandarin and croissant are grid "
     "volumes, whose means the half-space takes. Smooth boundaries, all scattering orders. Light is gathered by the "
-    f"model, or corrected by walks. FLIP and relative squared error of the pixels of the object. {NOTE}"
+    f"model, or corrected by walks and denoised. FLIP and relative squared error of the pixels of the object. {NOTE}"
 )
 
 FLOOR, GAP = (0.33, 0.3, 0.27), 0.02  # reflectance of the floor, and how far it lies below the lowest point, mm
@@ -88,14 +89,17 @@ def shown(task: Task) -> dict[str, object]:
         alone = {key: description[key] for key in ("type", "sensor", name)}
         covering = mi.load_dict({**alone, "integrator": {"type": "path"}})
         return reference_image(task, load_scene(description, p["model"]), covering)
-    description["integrator"] = {"type": "bssrdf", "light": p["light"]}
+    correct = p["light"] == "corrected"
+    description["integrator"] = {"type": "bssrdf", "light": p["light"], "layers": correct}
     with with_weights(task.folder, task.needed):
         loaded = load_scene(description, p["model"])
         mi.render(loaded, spp=COMPILING, seed=p["seed"] + 1)  # compiles
         began = time.process_time()
-        image = np.array(mi.render(loaded, spp=p["spp"], seed=p["seed"] + 2))[..., :3]
+        image = np.array(mi.render(loaded, spp=p["spp"], seed=p["seed"] + 2))
+        if correct:
+            image = Denoiser(loaded)(image)
     each = (time.process_time() - began) / p["spp"]
-    return {"image": image, "spp": p["spp"], "cpu seconds of a sample": each}
+    return {"image": image[..., :3].astype(np.float32), "spp": p["spp"], "cpu seconds of a sample": each}
 
 
 def scene(shown: SceneDict, view: View, size: int, low: float = 0.0) -> SceneDict:

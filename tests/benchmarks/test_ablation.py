@@ -32,6 +32,7 @@ from benchmarks.budgets import Samples, Seconds, Within
 from benchmarks.kept_rows import KeptRows
 from halfspace_sss import Medium, materials
 from halfspace_sss.arrays import library
+from halfspace_sss.comparison import model_errors
 from halfspace_sss.comparison.model_errors import ReferenceSize, TracedMaps, model_error, reference_maps
 from halfspace_sss.maps import noisy_maps
 from halfspace_sss.maps.noisy_maps import CellGrid, draw_directions, make_pool
@@ -52,6 +53,7 @@ ALMOST = 3 * BATCH - 1  # samples, for which three batches are needed
 def _fewer_directions() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "SETS", 1)
+        patch.setattr(model_errors, "GRID", CellGrid(16, 8))
         yield
 
 

@@ -43,6 +43,7 @@ def test_bad_input_ends_with_2_in_a_line(study: str, tmp_path: Path, monkeypatch
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_it_runs_from_the_repository() -> None:
     root = Path(__file__).resolve().parents[2]
     run = subprocess.run([sys.executable, "-m", "benchmarks", "-h"], capture_output=True, text=True, cwd=root)

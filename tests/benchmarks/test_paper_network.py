@@ -51,6 +51,7 @@ def test_the_papers_network_learns_from_walks(obj: TranslucentObject) -> None:
     assert steps > 10 and np.mean(learnt) < np.mean(fresh)
 
 
+@pytest.mark.slow
 def test_the_papers_training_stops_where_the_error_has_stayed_small(
     obj: TranslucentObject, monkeypatch: pytest.MonkeyPatch
 ) -> None:

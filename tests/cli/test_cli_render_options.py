@@ -53,6 +53,7 @@ def test_a_page_that_holds_all_it_shows_lies_beside_the_render(scene: Path) -> N
     assert str(scene.parent / "out" / "ball_scene.html") in result.stdout
 
 
+@pytest.mark.slow
 def test_a_denoised_image_lies_beside_the_other_and_on_the_page(scene: Path) -> None:
     pytest.importorskip("mitsuba_oidn")
     result = _render(scene, "--spp", "4", "--denoise")

@@ -28,8 +28,10 @@ from figures.app import app
 from halfspace_sss.maps.noisy_maps import CellGrid
 from halfspace_sss.neural.training.fit import Fit
 import halfspace_sss.neural.training.train_material
+from halfspace_sss.comparison import model_errors
+model_errors.GRID = CellGrid(16, 8)
 training = sys.modules["halfspace_sss.neural.training.train_material"]  # its package has a function of that name
-how = Fit(steps=20, n_groups=4, n_queries=32, validate_every=5)
+how = Fit(steps=20, n_groups=4, n_queries=32, validate_every=20)
 training.STANDARD = training.MaterialRecipe(n_groups=8, events=1e5, grid=CellGrid(8, 4), how=how)
 for command, arguments in json.loads(sys.argv[1]).items():
     result = CliRunner().invoke(app, [*command.split(), *arguments])

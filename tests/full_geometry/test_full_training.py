@@ -131,6 +131,7 @@ def test_weights_of_a_number_of_chunks_are_the_same_bits_by_one_thread_and_by_th
     assert found[0] == found[1]
 
 
+@pytest.mark.slow
 def test_the_file_gives_the_same_model_again(trained: Trained) -> None:
     obj = object_of(ball(), WAX)
     again = storing.load(storing.find_weights(obj, trained.path.parent), obj).model
@@ -175,11 +176,13 @@ def test_a_network_reads_pairs_backwards_as_it_reads_pairs_that_are_turned_round
     assert not torch.allclose(net(x), net(turned), atol=1e-2)
 
 
+@pytest.mark.slow
 def test_S_is_positive_and_finite(trained: Trained) -> None:
     S = S_of(trained.model)
     assert np.all(np.isfinite(S)) and np.all(S >= 0) and np.mean(S > 0) > 0.9
 
 
+@pytest.mark.slow
 def test_work_of_another_object_is_refused(trained: Trained) -> None:
     folder = trained.path.parents[1]
     with pytest.raises(ValueError, match="size_in_mfp"):
@@ -213,11 +216,13 @@ def test_no_training_gives_the_half_space_with_a_warning(tmp_path: Path) -> None
         ({"type": "cube"}, WAX, "must be trained"),
     ],
 )
+@pytest.mark.slow
 def test_weights_of_another_object_are_refused(trained: Trained, shape: dict, medium: Medium, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         storing.find_weights(object_of(mi.load_dict(shape), medium), trained.path.parent)
 
 
+@pytest.mark.slow
 def test_an_altered_file_is_refused(trained: Trained, tmp_path: Path) -> None:
     for path in (trained.path, trained.path.with_suffix(".json")):
         shutil.copy(path, tmp_path)
@@ -227,6 +232,7 @@ def test_an_altered_file_is_refused(trained: Trained, tmp_path: Path) -> None:
         storing.load(path, trained.model.object)
 
 
+@pytest.mark.slow
 def test_weights_of_other_inputs_are_refused(trained: Trained, tmp_path: Path) -> None:
     arrays, record = load_weights(trained.path, storing.KIND)
     path = tmp_path / trained.path.name
@@ -235,6 +241,7 @@ def test_weights_of_other_inputs_are_refused(trained: Trained, tmp_path: Path) -
         storing.load(path, trained.model.object)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changed", [{"base_model": "neural"}, {"reflections": 1}])
 def test_weights_that_multiply_something_else_are_refused(trained: Trained, changed: dict, tmp_path: Path) -> None:
     arrays, record = load_weights(trained.path, storing.KIND)
@@ -289,6 +296,7 @@ def test_bad_arguments_are_refused_before_any_walk(bad: dict, message: str, tmp_
         train(ball(), WAX, folder=tmp_path, **bad)
 
 
+@pytest.mark.slow
 def test_errors_of_models_are_asked_by_name(trained: Trained) -> None:
     few = {"exits": 32, "walks": 512, "samples": 512}
     rows = full_geometry.errors(ball(), WAX, folder=trained.path.parent, **few)
@@ -312,6 +320,7 @@ def test_an_object_of_a_scene_is_found_by_its_id() -> None:
         object_of(mi.load_dict({"type": "scene", "one": {**one, "bsdf": rough}}), None)
 
 
+@pytest.mark.slow
 def test_one_exit_gathers_many_entries_in_one_loop(trained: Trained) -> None:
     model, n, times = trained.model, 512, 4
     exits, entries = points_of(model, n)[0], points_of(model, n * times)[1]

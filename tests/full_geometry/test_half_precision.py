@@ -28,6 +28,7 @@ def in_half(x: Any) -> Any:
     return SINGLE([dr.float16_array_t(kind)(dr.clip(v, -256, 256)) for v in x])
 
 
+@pytest.mark.slow
 def test_the_network_of_all_shapes_is_off_by_less_than_its_noise(monkeypatch: pytest.MonkeyPatch) -> None:
     """Both S_0 and the correction are networks: 0.1 % in the median, 1 % nearly everywhere, none in the mean."""
     mi.set_variant("llvm_ad_rgb")

@@ -32,6 +32,7 @@ def _light(medium: dict[str, float], seed: int) -> tuple[float, float]:
     return float(np.log(T.mean())), float(T.std() / T.mean() / np.sqrt(T.size))
 
 
+@pytest.mark.slow
 def test_as_much_light_leaves_by_a_medium_beside_as_by_its_walks() -> None:
     obj = object_of(mi.load_dict({"type": "sphere", "radius": RADIUS}), Medium.from_albedo(**MEDIUM, eta=1.3))
     model = transport(obj)

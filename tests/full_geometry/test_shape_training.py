@@ -127,6 +127,7 @@ def test_parts_of_groups_are_samples_of_the_means_over_the_object() -> None:
         assert abs(found.mean() - wanted) < 4 * found.std() / np.sqrt(len(found))  # z-test, 6e-5
 
 
+@pytest.mark.slow
 def test_a_fit_follows_the_light_of_groups() -> None:
     def brightness(weight: float) -> float:
         own = grouped(data_of(0))

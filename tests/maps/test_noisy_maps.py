@@ -54,6 +54,7 @@ def _copies(reference: TracedMaps, block: int) -> np.ndarray:
     return E.reshape(COPIES, SET, *E.shape[1:])
 
 
+@pytest.mark.slow
 @over_media
 @pytest.mark.parametrize("i", [0, 4])
 def test_the_sum_over_the_plane_is_the_traced_reflectance(references: list[TracedMaps], k: int, i: int) -> None:

@@ -41,17 +41,17 @@ def _with_single(R: float, t: Truth) -> float:
 
 
 @pytest.mark.slow
-def test_every_other_reflectance_of_the_table_is_met_within_1_5_percent() -> None:
+def test_every_fourth_reflectance_of_the_table_is_met_within_1_5_percent() -> None:
     """`python -m benchmarks truths` tells all of them."""
     models, known, off = {}, {}, {}
-    for t in _bright(("R_d", "R_total"))[::2]:
+    for t in _bright(("R_d", "R_total"))[::4]:
         key = (t.medium, t.mu_i)
         if key not in known:
             model = models.setdefault(t.medium, bssrdf("neural", t.medium))
             known[key] = sampled_reflectance(model, t.mu_i, points=POINTS)[0]
         doubt = 3 * t.uncertainty if t.kind == "published" else 0.0  # walks of others, few digits
         off[t.id] = (abs(_with_single(known[key], t) - t.value) - doubt) / t.value
-    assert len(off) > 125 and any(t.medium.eta == 1 for t in _bright(("R_d",)))
+    assert len(off) > 62 and any(t.medium.eta == 1 for t in _bright(("R_d",)))
     assert {row: round(v, 4) for row, v in off.items() if v > WITHIN} == {}
     assert np.median(list(off.values())) < 0.003
 

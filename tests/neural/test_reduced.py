@@ -25,6 +25,7 @@ def _models() -> list[Neural]:
     return [Neural(Medium.from_albedo(float(a), 1.0, G, ETA)) for a in ALBEDOS]
 
 
+@pytest.mark.slow
 def test_reduced_networks_have_the_S_of_each_albedo() -> None:
     """Sums over distances and directions to 1 %, of magnitudes of the difference to 3 %."""
     models, u = _models(), np.random.default_rng(5).uniform(size=(5, N)).astype(np.float32)

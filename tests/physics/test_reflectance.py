@@ -89,6 +89,7 @@ print(*map(float.hex, np.polynomial.legendre.leggauss(96)[0][:4]))
 """
 
 
+@pytest.mark.slow
 def test_results_do_not_depend_on_the_kernels_of_the_linear_algebra():
     def run(kernel):
         environment = os.environ | {"OPENBLAS_CORETYPE": kernel, "OPENBLAS_NUM_THREADS": "1"}

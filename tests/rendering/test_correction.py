@@ -227,6 +227,7 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(correction, name, getattr(correction, name) // 8)
 
 
+@pytest.mark.slow
 def test_its_layer_of_emission_is_that_of_walks(few: None) -> None:
     """The sky beside a ball and in its mirror; without it, the image is as without layers."""
     scene, images = _scene("walk", MEDIUM, _lamp(), hidden=False), []
@@ -241,6 +242,7 @@ def test_its_layer_of_emission_is_that_of_walks(few: None) -> None:
     np.testing.assert_allclose(layered[..., 3:], walked[..., 3:], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_its_error_in_an_image_is_that_of_the_part_that_is_no_emission(few: None, tmp_path: Path) -> None:
     scene, found = _scene("walk", MEDIUM, _lamp(), hidden=False), {}
     for layers in (True, False):
@@ -277,6 +279,7 @@ def test_a_render_in_passes_has_walks_by_all_its_samples(scene: Any, few: None, 
     assert int(told.split("corrected by ")[1].split()[0]) > 1.5 * correction.FEWEST
 
 
+@pytest.mark.slow
 def test_a_render_to_an_error_has_walks_until_light_takes_at_most_half_of_its_square(
     scene: Any, few: None, tmp_path: Path
 ) -> None:

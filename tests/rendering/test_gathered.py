@@ -172,6 +172,7 @@ def test_light_is_gathered_anew_when_an_emitter_was_edited() -> None:
     assert "gathered at" in edited.integrator().gathered[0]
 
 
+@pytest.mark.slow
 def test_a_first_look_has_half_of_the_light_and_the_image_after_it_all() -> None:
     scene = _scene("gathered", lights=_lights("lamp"))
     integrator, sensor = scene.integrator(), scene.sensors()[0]
@@ -281,6 +282,7 @@ def test_directions_that_are_traced_further_cover_the_hemisphere() -> None:
     assert (np.abs(np.histogram(u[0], 8, (0, 1))[0] / 512 - 1) < 0.25).all()
 
 
+@pytest.mark.slow
 def test_s_leans_towards_the_other_end_by_a_network_and_not_by_a_dipole() -> None:
     scenes = _gathered("better_dipole", "lamp"), _gathered("neural", "point")
     by_dipole, by_network = (scene.integrator().prepare(scene)[0].gathered.matrix.g[:6] for scene in scenes)

@@ -82,6 +82,7 @@ def test_light_is_that_of_traced_events_within_1_percent_and_beside_a_floor_with
     assert (np.abs(gathered.mean(axis=0) - traced.mean(axis=0)) < most * traced.mean(axis=0) + 5 * noise).all()
 
 
+@pytest.mark.slow
 def test_pixels_of_a_sample_have_a_tenth_of_the_variance_at_most() -> None:
     traced, gathered = (x[:, 4:8, 4:8] for x in _pictures("windows"))
     assert np.median(64 * gathered.var(axis=0, ddof=1)) < 0.1 * np.median(1024 * traced.var(axis=0, ddof=1))

@@ -40,6 +40,7 @@ def _geometry(shape: dict) -> Any:
     return analyse_shape(scene.shapes()[0], scene)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["sphere", "cube"])
 def test_depths_are_distances_to_the_nearest_point_of_the_surface(kind: str) -> None:
     geometry = _geometry({"type": kind})

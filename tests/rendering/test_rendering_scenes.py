@@ -250,6 +250,7 @@ def test_the_environment_may_have_any_colour():
     assert mean[2] == 0 and abs(mean[1] / mean[0] - 0.5) < 0.01
 
 
+@pytest.mark.slow
 def test_the_command_renders_a_file_in_a_process_of_its_own(tmp_path):
     file = tmp_path / "ball.xml"
     file.write_text(XML)

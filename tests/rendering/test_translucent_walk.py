@@ -176,6 +176,7 @@ def test_connections_bring_the_light_that_chance_brings_with_less_noise() -> Non
     assert 64 * np.median(joined.var(axis=0)) < 0.05 * 1024 * left_to_chance.var(axis=0).mean()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lit", ["lamp", "point"])
 def test_directions_bring_light_through_a_rough_boundary_that_chance_brings_with_less_noise(lit: str) -> None:
     """Phase functions whose forward peak looks away from the emitter rarely scatter towards it."""

@@ -252,6 +252,7 @@ def test_precomputed_light_of_two_balls_that_touch_has_the_mean_of_sampled_light
     _compare(MEDIUM, 0.02, _ball(2.5, center=[-2.5, 0, 0]), other=other, lamp=_lamp())
 
 
+@pytest.mark.slow
 def test_precomputed_light_of_a_lamp_has_the_mean_of_sampled_light() -> None:
     _compare(MEDIUM, 0.015, spp=512, lamp=_lamp())
 
@@ -469,6 +470,7 @@ def test_reflections_are_followed_in_clear_objects_unless_an_emitter_is_as_small
     assert scene.integrator().tracer(scene, 0, ImageSamples(64, 64)).visitor.follows == follows
 
 
+@pytest.mark.slow
 def test_the_layer_of_emission_holds_what_is_seen_through_an_object_after_reflections_inside() -> None:
     """A cube that scatters nothing back and lets most light through, in a room with one window."""
     scene = _scene("auto", CLEAR, _cube(), light=_window())

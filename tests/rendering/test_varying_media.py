@@ -72,6 +72,7 @@ def test_a_grid_that_is_the_same_everywhere_is_a_homogeneous_medium(light: str, 
     assert np.abs(_z(a, b)).max() < WIDEST_Z
 
 
+@pytest.mark.slow
 def test_null_collisions_change_nothing() -> None:
     """A bright voxel beyond the object raises the majorant, nothing else."""
     values = np.ones((1, 1, 8, 3)) * [0.51, 1.1, 2.5]
