@@ -13,7 +13,7 @@ from halfspace_sss.backend import clock, needed
 if TYPE_CHECKING:
     import mitsuba as mi
 
-GUIDE_SPP = 32  # twice as many take two more seconds at 512 x 512, for 1 to 2 % less error where there are textures
+GUIDE_SPP = 32  # twice as many take another second at 512 x 512, for 1 to 2 % less error where there are textures
 MARGIN = 32  # pixels around surfaces that the denoiser sees too
 GUIDES = "albedo:albedo,n:sh_normal"  # of the integrator `aov`
 
