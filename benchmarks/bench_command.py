@@ -171,7 +171,7 @@ def _rows(part: str, backend: str, quick: bool, tables: dict[str, list[dict]]) -
     if part == "volpath":
         return bench.bench_volpath(tables["walk"], *((16, 4, (64,)) if quick else ()))
     if part == "models":
-        return bench.bench_models(n=1024, least_seconds=0.01) if quick else bench.bench_models()
+        return bench.bench_models(n=64, least_seconds=0.01) if quick else bench.bench_models()
     if part == "trace":
         return bench.bench_traces(backend, 2**16 if quick else EVENTS[backend], bench.MEDIA[: 1 if quick else None])
     if part == "guided":

@@ -94,7 +94,7 @@ def test_the_fit_of_deng_finds_two_colours_in_photographs_that_its_model_has_mad
     path = ball(tmp_path)
     truth, part = halves(path), {"filename": str(path)}
     painted = [deng.painted(part, tmp_path / f"{k}.ply", ETA, t, reflection=False) for k, t in ((0, truth), (1, None))]
-    made, blank = (Studio({"ball": p}, "ball", 16, 24, 3, deng.MODEL) for p in painted)
+    made, blank = (Studio({"ball": p}, "ball", 16, 12, 3, deng.MODEL) for p in painted)
     found = deng.fit(blank, made.photographs(64, 5), texels=1000, steps=25, spp=16)
     up = truth.albedo[:, 0] == GREEN[0]
     errors = [np.abs(a - truth.albedo).mean() for a in (np.full(3, deng.START[0]), found.albedo)]

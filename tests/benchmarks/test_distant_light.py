@@ -41,7 +41,7 @@ def test_the_network_of_distant_light_learns_where_light_comes_from(
 ) -> None:
     """Of a white ball: the mean over lights of f and of f times the cosine at the exit are those of walks."""
     monkeypatch.setattr(distant_light, "CHUNK", 2**13)
-    net = distant_light.fit_distant(white, 1.0, steps=150)
+    net = distant_light.fit_distant(white, 1.0, steps=110)
     exits = white.random_points(generator(mi, 2**10, pass_seed(5)))
     walks = distant_light.distant_walks(white, exits, (6,))
     p, w_o, w = np.split(walks.x, 3, axis=1)

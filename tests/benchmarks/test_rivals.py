@@ -85,7 +85,7 @@ def test_alpha_is_the_light_that_comes_back_from_everywhere(obj: TranslucentObje
 
 @pytest.mark.slow
 def test_a_little_training_brings_alpha_to_the_truth(obj: TranslucentObject) -> None:
-    model = fit_alpha_p(obj, FlowRecipe(steps=320, chunk=2**13, batch=512, rate=8e-3))
+    model = fit_alpha_p(obj, FlowRecipe(steps=160, chunk=2**13, batch=512, rate=8e-3))
     truth = reference(obj, 64, 512)
     alpha = np.array(model.prepare(truth.exits).alpha)
     wanted = (truth.truth.mean[:, :, 0] / np.array(model.scale)[:, None]).mean(axis=0)

@@ -30,13 +30,14 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Result]:
     """Both parts of one material, small and short."""
     train = training.train
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(training, "train", lambda *a, **how: train(*a, **{**how, "recipe": QUICK, "chunks": 2}))
+        patch.setattr(training, "train", lambda *a, **how: train(*a, **{**how, "recipe": QUICK, "chunks": 1}))
         gather_by_few(patch.setattr)
         for name, value in (("EXITS", 16), ("WALKS", 128), ("SAMPLES", 64)):
             patch.setattr(training, name, value)
         for name, value in (("SCENES", (("ketchup", "both"),)), ("SIZES", SIZE), ("TRUTH_SPP", 64)):
             patch.setitem(getattr(fig05, name), "draft", value)
-        patch.setitem(fig05.SECONDS, "draft", 1.0)
+        patch.setitem(fig05.SECONDS, "draft", 0.4)
+        patch.setattr(fig05, "WARM_UP", 0.1)
         return {part.name: _result(part, tmp_path_factory.mktemp("part")) for part in fig05.parts("draft")}
 
 
