@@ -253,24 +253,18 @@ def test_precomputed_light_of_two_balls_that_touch_has_the_mean_of_sampled_light
 
 
 @pytest.mark.slow
-def test_precomputed_light_of_a_lamp_has_the_mean_of_sampled_light() -> None:
-    _compare(MEDIUM, 0.015, spp=512, lamp=_lamp())
-
-
-@pytest.mark.slow
 def test_a_lamp_that_looks_small_from_a_part_of_a_ball_has_the_same_mean_by_sampled_light() -> None:
     """Connections are made at events from which it does, and nowhere else."""
     lamp = {"type": "sphere", "center": [-19, 20, 10], "radius": 8.0, "emitter": {"type": "area", "radiance": 6.0}}
     ball, medium = _ball(4.0), {"sigma_s": 1.0, "sigma_a": 0.02, "eta": 1.5}
-    _compare(medium, 0.006, ball, spp=6144, fewer=4, lamp=lamp)  # 2.4 % too bright if asked at the events after those
+    _compare(medium, 0.006, ball, spp=4096, fewer=4, lamp=lamp)  # 2.4 % too bright if asked at the events after those
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("g", [0.0, 0.5])
-def test_precomputed_light_around_and_in_what_lies_inside_has_the_mean_of_sampled_light(g: float) -> None:
+def test_precomputed_light_around_and_in_what_lies_inside_has_the_mean_of_sampled_light() -> None:
     held = {"medium": _held("medium", -1.8, 1.5), "bubble": _held("bubble", 1.8, 1.5)}
     stone = {**_ball(1.2, center=[0, -2.5, 3]), "bsdf": {"type": "diffuse", "reflectance": 0.7}}
-    _compare({**MEDIUM, "g": g}, 0.02, spp=320, stone=stone, lamp=_lamp(20.0), **held)
+    _compare({**MEDIUM, "g": 0.5}, 0.02, spp=320, stone=stone, lamp=_lamp(20.0), **held)
 
 
 @pytest.mark.slow
@@ -323,7 +317,7 @@ def test_what_is_left_of_a_phase_function_is_forward_and_at_most_all_of_it(g: fl
     assert (p * kept**2)[backward].sum() < 0.05 * p[backward].sum()  # one-sided quadratics leave .6 there at g = .9
 
 
-FORWARD = {"sigma_s": "10.0,15.0,20.0", "sigma_a": "0.01,0.05,0.3", "eta": 1.4}
+FORWARD = {"sigma_s": "5.0,7.5,10.0", "sigma_a": "0.01,0.05,0.3", "eta": 1.4}
 
 
 @pytest.mark.parametrize(
@@ -341,7 +335,7 @@ def test_precomputed_light_of_a_lamp_has_the_mean_of_sampled_light_where_scatter
     lamp = {"lamp": _lamp(15.0)}
     if case == "rough":
         rough = {"type": "roughdielectric", "alpha": 0.3, "int_ior": 1.4, "ext_ior": 1.0}
-        _compare({**FORWARD, "g": 0.8, "boundary": rough}, 0.012, spp=768, fewer=1, **lamp)
+        _compare({**FORWARD, "g": 0.8, "boundary": rough}, 0.012, spp=1536, fewer=4, **lamp)
     else:  # 5 mean free paths
         _compare({**MEDIUM, "g": 0.9}, 0.02, _ball(2.0), spp=6144, fewer=3, **lamp)
 
