@@ -29,7 +29,7 @@ def test_all_ways_have_the_same_time_in_which_light_is_gathered(
     }
     monkeypatch.setattr(gathered, "WAYS", ways)
     monkeypatch.setitem(gathered.SIZES, "draft", 24)
-    monkeypatch.setitem(gathered.SECONDS, "draft", 1.0)
+    monkeypatch.setitem(gathered.SECONDS, "draft", 0.4)
     monkeypatch.setitem(gathered.TRUTH_SPP, "draft", 64)
     results = {}
     for part in gathered.parts("draft"):

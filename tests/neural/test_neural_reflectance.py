@@ -41,17 +41,17 @@ def _with_single(R: float, t: Truth) -> float:
 
 
 @pytest.mark.slow
-def test_every_fourth_reflectance_of_the_table_is_met_within_1_5_percent() -> None:
+def test_every_eighth_reflectance_of_the_table_is_met_within_1_5_percent() -> None:
     """`python -m benchmarks truths` tells all of them."""
     models, known, off = {}, {}, {}
-    for t in _bright(("R_d", "R_total"))[::4]:
+    for t in _bright(("R_d", "R_total"))[::8]:
         key = (t.medium, t.mu_i)
         if key not in known:
             model = models.setdefault(t.medium, bssrdf("neural", t.medium))
             known[key] = sampled_reflectance(model, t.mu_i, points=POINTS)[0]
         doubt = 3 * t.uncertainty if t.kind == "published" else 0.0  # walks of others, few digits
         off[t.id] = (abs(_with_single(known[key], t) - t.value) - doubt) / t.value
-    assert len(off) > 62 and any(t.medium.eta == 1 for t in _bright(("R_d",)))
+    assert len(off) > 31 and any(t.medium.eta == 1 for t in _bright(("R_d",)))
     assert {row: round(v, 4) for row, v in off.items() if v > WITHIN} == {}
     assert np.median(list(off.values())) < 0.003
 
@@ -113,7 +113,7 @@ DAILY_CORNERS = [
 
 
 @pytest.mark.parametrize(
-    "corners", [pytest.param(DAILY_CORNERS, id="some"), pytest.param(CORNERS[::4], id="more", marks=pytest.mark.slow)]
+    "corners", [pytest.param(DAILY_CORNERS, id="some"), pytest.param(CORNERS[::8], id="more", marks=pytest.mark.slow)]
 )
 def test_reflectances_of_the_corners_of_the_range_are_met_within_1_5_percent_and_none_is_above_1(corners) -> None:
     """At albedo 1, g 0.98 it was 0.76 to 2.3 times the exact one for eta 1 to 1.05, 3 to 6 % off for larger ones."""

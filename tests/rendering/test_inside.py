@@ -219,7 +219,8 @@ def test_lamps_outside_are_found_by_chance_and_for_empty_objects_beside_by_conne
                         "bsdf": _wax()}  # fmt: skip
     lamp = {"light": _ball(1.6, (1.5, 3, 2.5), emitter={"type": "area", "radiance": 10.0})}
     scene = _scene(inside, lamp)
-    _agree(_means(mi.load_dict(scene), 2048, 1), _means(_theirs(scene, holders), 2048, 1001), 0.02)
+    # the lamp is connected with, and has an eighth of the noise
+    _agree(_means(mi.load_dict(scene), 256, 1), _means(_theirs(scene, holders), 2048, 1001), 0.02)
 
 
 @pytest.mark.slow

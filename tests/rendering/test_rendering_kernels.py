@@ -13,6 +13,8 @@ import halfspace_sss
 mi = pytest.importorskip("mitsuba")
 import drjit as dr  # noqa: E402
 
+from full_geometry.transport import any_shape  # noqa: E402
+
 pytestmark = pytest.mark.usefixtures("little_light")
 
 
@@ -23,6 +25,13 @@ def _variant():
     mi.set_variant("llvm_ad_rgb")
     full_geometry.register()
     gc.collect()
+
+
+@pytest.fixture(autouse=True)
+def _few_walks(monkeypatch):
+    """Of what `neural_shape` is calibrated by."""
+    monkeypatch.setattr(any_shape, "WALKS", (2**12, 2**12))
+    monkeypatch.setattr(any_shape, "PAIRS", (2**12, 2**12))
 
 
 def loaded(material: str, model: str, mm_per_unit: float = 3.0, crop: tuple[int, ...] = (0, 0, 4, 4), light: str = ""):

@@ -54,15 +54,17 @@ def _means(scene: Any, runs: int, spp: int, seed: int) -> np.ndarray:
 
 
 def _compare(
-    surface: dict, known_to: float, shape: dict | None = None, spp: int = 1024, fewer: int = 4, **more: Any
-) -> None:
+    surface: dict, known_to: float, shape: dict | None = None, spp: int = 1024, fewer: int = 4, runs: int = 5,
+    **more: Any,
+) -> None:  # fmt: skip
     """Mean colours with precomputed and with sampled light agree, and are known to a share of themselves.
 
-    Precomputed light of lamps has less noise, and takes `fewer` times fewer samples.
+    Precomputed light of lamps has less noise, and takes `fewer` times fewer samples, in `runs` launches with cells of
+    their own.
     """
     found, wanted = (
-        _means(_scene(light, surface, shape, **more), runs, n, seed)
-        for light, runs, n, seed in (("precomputed", 8, spp // fewer, 1), ("sampled", 12, spp, 101))
+        _means(_scene(light, surface, shape, **more), launches, n, seed)
+        for light, launches, n, seed in (("precomputed", runs, spp // fewer, 1), ("sampled", 12, spp, 101))
     )
     error = np.hypot(*(x.std(axis=0, ddof=1) / np.sqrt(len(x)) for x in (found, wanted)))
     assert (error < known_to * wanted.mean(axis=0)).all(), error / wanted.mean(axis=0)
@@ -257,14 +259,14 @@ def test_a_lamp_that_looks_small_from_a_part_of_a_ball_has_the_same_mean_by_samp
     """Connections are made at events from which it does, and nowhere else."""
     lamp = {"type": "sphere", "center": [-19, 20, 10], "radius": 8.0, "emitter": {"type": "area", "radiance": 6.0}}
     ball, medium = _ball(4.0), {"sigma_s": 1.0, "sigma_a": 0.02, "eta": 1.5}
-    _compare(medium, 0.006, ball, spp=4096, fewer=4, lamp=lamp)  # 2.4 % too bright if asked at the events after those
+    _compare(medium, 0.006, ball, spp=4096, runs=8, lamp=lamp)  # 2.4 % too bright if asked at the events after those
 
 
 @pytest.mark.slow
 def test_precomputed_light_around_and_in_what_lies_inside_has_the_mean_of_sampled_light() -> None:
     held = {"medium": _held("medium", -1.8, 1.5), "bubble": _held("bubble", 1.8, 1.5)}
     stone = {**_ball(1.2, center=[0, -2.5, 3]), "bsdf": {"type": "diffuse", "reflectance": 0.7}}
-    _compare({**MEDIUM, "g": 0.5}, 0.02, spp=320, stone=stone, lamp=_lamp(20.0), **held)
+    _compare({**MEDIUM, "g": 0.5}, 0.02, spp=320, runs=8, stone=stone, lamp=_lamp(20.0), **held)
 
 
 @pytest.mark.slow
@@ -296,7 +298,7 @@ def test_precomputed_light_has_the_mean_of_sampled_light(case: str) -> None:
     if case == "point":
         _compare(MEDIUM, 0.02, light={"type": "point", "position": [20, 25, 10], "intensity": 900.0})
     elif case == "floor":
-        _compare(MEDIUM, 0.02, spp=256, floor=floor, **lamp)
+        _compare(MEDIUM, 0.02, spp=256, runs=8, floor=floor, **lamp)
     else:
         _compare(PAINTED, 0.01, _cube(), spp=768, **lamp)
 
@@ -335,9 +337,9 @@ def test_precomputed_light_of_a_lamp_has_the_mean_of_sampled_light_where_scatter
     lamp = {"lamp": _lamp(15.0)}
     if case == "rough":
         rough = {"type": "roughdielectric", "alpha": 0.3, "int_ior": 1.4, "ext_ior": 1.0}
-        _compare({**FORWARD, "g": 0.8, "boundary": rough}, 0.012, spp=1536, fewer=4, **lamp)
+        _compare({**FORWARD, "g": 0.8, "boundary": rough}, 0.012, spp=1536, runs=8, **lamp)
     else:  # 5 mean free paths
-        _compare({**MEDIUM, "g": 0.9}, 0.02, _ball(2.0), spp=6144, fewer=3, **lamp)
+        _compare({**MEDIUM, "g": 0.9}, 0.02, _ball(2.0), spp=6144, fewer=3, runs=8, **lamp)
 
 
 @pytest.mark.slow
