@@ -31,7 +31,7 @@ from one_thread import work_in_one_thread
 import halfspace_sss
 from benchmarks.truths import TABLE
 from halfspace_sss import backend
-from halfspace_sss.comparison import reflectance_curves
+from halfspace_sss.comparison import reflectance_curves, style
 from halfspace_sss.materials import catalogue as registry
 from halfspace_sss.neural import material_model, paper_model, store
 from halfspace_sss.neural.network import N_FEATURES, layer_shapes
@@ -129,6 +129,14 @@ def speeds_are_measured_shortly() -> Iterator[None]:
     """Of models in a set of curves, for a hundredth of a second each in place of a tenth."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(reflectance_curves.evaluations_per_s, "__defaults__", (4096, 0.01))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def figures_are_drawn_coarsely() -> Iterator[None]:
+    """At 60 dots an inch in place of 300, a fraction of the pixels."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(style.saved, "__defaults__", (60,))
         yield
 
 

@@ -89,7 +89,7 @@ from figures.parts import command as figure_command
 from full_geometry.learning import model_errors as errors_of_objects
 from full_geometry.learning import training
 from full_geometry.transport import any_shape
-from halfspace_sss.comparison import model_errors, reflectance_curves
+from halfspace_sss.comparison import model_errors, reflectance_curves, style
 from halfspace_sss.maps.noisy_maps import CellGrid
 from halfspace_sss.neural.training.train_material import FAST
 import halfspace_sss.neural.training.train_material
@@ -99,6 +99,7 @@ one_thread.work_in_one_thread()
 fig09.SHOWN, fig09.MODELS, fig09.SIZES = {"draft": ("ketchup",)}, ("better_dipole",), {"draft": 12}
 fig09.MODEL_SPP["draft"], fig09.TRUTH_SPP["draft"] = 4, 16
 reflectance_curves.evaluations_per_s.__defaults__ = (4096, 0.01)
+reflectance_curves.REFLECTANCE_POINTS = 2**8
 fig10.WALKS["draft"], fig10.accepting = 2**14, lambda medium: ["better_dipole", "neural"]
 figure_command.MOST_WORKERS = 1  # others would import and compile for themselves
 # walks of numbers that nobody reads
@@ -108,7 +109,8 @@ few = dataclasses.replace(training.STANDARD, chunk=2**12)
 training.TrainingPlan = functools.partial(training.TrainingPlan, recipe=few)
 errors_of_objects.errors_of.__kwdefaults__.update(walks=256, samples=64)
 quick_light.gather_by_few(setattr)
-model_errors.GRID = CellGrid(16, 8)
+model_errors.GRID, model_errors.LAST_N_PSI = CellGrid(16, 8), model_errors.FIRST_N_PSI
+style.saved.__defaults__ = (60,)
 train_material = sys.modules["halfspace_sss.neural.training.train_material"]  # a function of the package has its name
 train_material.FAST = train_material.STANDARD = dataclasses.replace(FAST, n_groups=16, events=1e5, grid=CellGrid(8, 4))
 recipes = train_material.MaterialRecipe

@@ -47,6 +47,7 @@ def _errors(*arguments: str) -> Any:
 def _small(monkeypatch: Any, tmp_path: Path) -> None:
     """Recipes of a second and coarse maps, in an empty folder, where weights are looked up too."""
     monkeypatch.setattr(model_errors, "GRID", CellGrid(16, 8))
+    monkeypatch.setattr(model_errors, "LAST_N_PSI", model_errors.FIRST_N_PSI)
     for name in ("STANDARD", "FAST"):
         monkeypatch.setattr(train_material, name, TINY)
     monkeypatch.setattr(universal_training, "UniversalRecipe", lambda: TINY_UNIVERSAL)

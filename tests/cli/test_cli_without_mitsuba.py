@@ -28,8 +28,9 @@ from figures.app import app
 from halfspace_sss.maps.noisy_maps import CellGrid
 from halfspace_sss.neural.training.fit import Fit
 import halfspace_sss.neural.training.train_material
-from halfspace_sss.comparison import model_errors
-model_errors.GRID = CellGrid(16, 8)
+from halfspace_sss.comparison import model_errors, reflectance_curves, style
+model_errors.GRID, model_errors.LAST_N_PSI = CellGrid(16, 8), model_errors.FIRST_N_PSI
+reflectance_curves.REFLECTANCE_POINTS, style.saved.__defaults__ = 2**8, (60,)
 training = sys.modules["halfspace_sss.neural.training.train_material"]  # its package has a function of that name
 how = Fit(steps=20, n_groups=4, n_queries=32, validate_every=20)
 training.STANDARD = training.MaterialRecipe(n_groups=8, events=1e5, grid=CellGrid(8, 4), how=how)

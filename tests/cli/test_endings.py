@@ -39,10 +39,12 @@ SMALL = {  # a small run of each command, and what it refuses
 HARNESS = """
 import atexit, dataclasses, gc, json, os, signal, subprocess, sys
 from pathlib import Path
-import matplotlib.pyplot, pandas, scipy.interpolate, torch._dynamo, xarray, zarr  # once for all runs: each is a fork
+# once for all runs: each is a fork
+import matplotlib.backends.backend_pdf, matplotlib.pyplot, pandas, scipy.interpolate, scipy.stats
+import torch._dynamo, xarray, zarr
 import quick_kernels
 from halfspace_sss.cli import shared
-from halfspace_sss.comparison import reflectance_curves
+from halfspace_sss.comparison import model_errors, reflectance_curves, style
 from figures import fig10
 from figures.parts import command
 from figures import app as cli
@@ -55,6 +57,9 @@ training.FAST = dataclasses.replace(FAST, n_groups=16, events=1e5, grid=CellGrid
 command.MOST_WORKERS = 1  # the process that is interrupted writes the files, and no other has written some by then
 quick_kernels.compile_quickly()
 reflectance_curves.evaluations_per_s.__defaults__ = (4096, 0.01)
+reflectance_curves.REFLECTANCE_POINTS = 2**8
+model_errors.GRID, model_errors.LAST_N_PSI = CellGrid(16, 8), model_errors.FIRST_N_PSI
+style.saved.__defaults__ = (60,)
 gc.freeze()
 
 for folder, mount, moment, arguments in json.loads(sys.argv[1]):

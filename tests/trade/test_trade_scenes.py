@@ -343,7 +343,8 @@ def test_an_unknown_way_is_refused_with_the_nearest() -> None:
 
 @pytest.mark.usefixtures("little_light")
 @pytest.mark.slow
-def test_auto_is_chosen_once_kept_and_found_again(tmp_path: Path) -> None:
+def test_auto_is_chosen_once_kept_and_found_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(automatic, "Effort", lambda: Effort(1.0, exits=64))
     names = []
     asked = scene({"sigma_s": 95.0, "sigma_a": 5.0}, model="auto")
     asked["integrator"]["tolerance"] = 0.3
