@@ -16,12 +16,15 @@ pytest.importorskip("flip_evaluator")
 import benchmarks.__main__  # noqa: E402, F401 - its figures
 from benchmarks import thin_figure as thin  # noqa: E402
 from figures.parts import runner  # noqa: E402
+from full_geometry.transport import any_shape  # noqa: E402
 
 
 @pytest.fixture()
 def small(monkeypatch: pytest.MonkeyPatch, little_light: None) -> None:
     monkeypatch.setattr(thin, "THINGS", {"leaf": thin.THINGS["leaf"]})
     monkeypatch.setattr(thin, "MODELS", ("better_dipole", "neural_shape"))
+    monkeypatch.setattr(any_shape, "WALKS", (2**13, 2**15))
+    monkeypatch.setattr(any_shape, "PAIRS", (2**15, 2**16))
     for name, value in {"SIZES": 24, "RESOLUTION": 48, "MODEL_SPP": 64, "TRUTH_SPP": 64}.items():
         monkeypatch.setitem(getattr(thin, name), "draft", value)
 

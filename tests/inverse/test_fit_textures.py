@@ -242,7 +242,7 @@ def test_reflectance_path_length_and_roughness_of_a_photographed_object_explain_
         row = {"image": f"{k}.exr", "mask": f"mask{k}.exr", "camera": camera, "edits": {"lamp.position": place}}
         rows.append({**row, "held_out": k == 2})
     (tmp_path / "views.json").write_text(json.dumps({"views": rows}))
-    settings = inverse.FitSettings(steps=6, spp=32, light="precomputed", test_spp=256)
+    settings = inverse.FitSettings(steps=8, spp=32, light="precomputed", test_spp=256)
     views = read_views(tmp_path / "views.json")
     start = scene(np.full((4, 4, 3), 0.25), 0.2, 0.8)
     found = inverse.fit(start, views, ("reflectance", "mfp", "alpha"), settings=settings)

@@ -53,7 +53,9 @@ def test_corrected_light_has_the_mean_of_walks_within_its_error(file: str, monke
 
 @pytest.mark.slow
 def test_precomputed_light_of_two_media_has_the_mean_of_sampled_light() -> None:
-    (found, one), (truth, other) = (_mean(_scene("fruit", "path_traced", light), 24) for light in ("auto", "sampled"))
+    (found, one), (truth, other) = (
+        _mean(_scene("fruit", "path_traced", light), 24, 6) for light in ("auto", "sampled")
+    )
     error = np.hypot(one, other)
     assert (error < 0.03 * truth).all() and (found != truth).all()
     assert (np.abs(found - truth) < 0.005 * truth + 4 * error).all(), (found / truth, error / truth)
