@@ -63,7 +63,7 @@ INTRODUCTION = """\
 
 `python -m benchmarks figures all trade` makes these tables, the figure and the data that `halfspace-sss trade` shows.
 The bunny is 37 mm tall; the spikes, a ball with bumps and thorns, are about as large across. The small light stands
-behind the object: the camera sees transmitted light. Walks have sampled light.
+behind the object: the camera sees transmitted light. `path_traced` alone are walks with sampled light.
 
 | term | meaning |
 |---|---|
@@ -77,16 +77,6 @@ behind the object: the camera sees transmitted light. Walks have sampled light.
 `full_geometry` learnt the bunny but not the spikes, which stand for a new object. Half-space models lack unscattered
 light: most of their bias of ketchup. Costs of gathered light are above those of renders, which have
 [numbers of low discrepancy](light.md#numbers-of-low-discrepancy).
-"""
-KNOBS = """\
-Bunny, small light; cost over the usual setting's, error where the setting has one.
-
-| knob | meaning |
-|---|---|
-| entries | parameter of `bssrdf` |
-| channels in one walk | no setting: the cost of a walk for each channel, which one walk for all saves |
-| nodes | `n_samples` of photon beam diffusion: time of S alone, error against walks of the half-space |
-| precision | of a network, measured as nodes; no setting: single precision, on CUDA half |
 """
 
 
@@ -113,7 +103,7 @@ def trade_table(scenes: Scenes) -> pandas.DataFrame:
     return pandas.DataFrame(rows)
 
 
-def markdown(scenes: Scenes, seconds: float, settings: Sequence[Mapping[str, object]] = ()) -> str:
+def markdown(scenes: Scenes, seconds: float) -> str:
     """What is recommended, the bias of every way, and its cost; `seconds` is what each scene had."""
     lines = [INTRODUCTION.format(seconds=seconds), "## The cheapest technique within a tolerance", ""]
     lines += ["For images of 512 x 512 pixels; in brackets seconds of all cores for all images, training included.", ""]
@@ -135,13 +125,6 @@ def markdown(scenes: Scenes, seconds: float, settings: Sequence[Mapping[str, obj
         "",
     ]
     lines += _grid(scenes, lambda w, o: f"{w.cost / o.traced.cost:.2g}")
-    if settings:
-        lines += ["", "## Knobs", "", KNOBS]
-        lines += ["| material | knob | setting | way | cost | error, % |", "|---|---|---:|---|---:|---:|"]
-        for s in settings:
-            words = " | ".join(str(s[key]) for key in ("material", "knob", "value", "way"))
-            error = short(100 * s["error"]) if s["knob"] in ("nodes", "precision") else "–"  # the others change none
-            lines.append(f"| {words} | {short(s['cost'])} | {error} |")
     return "\n".join(lines) + "\n"
 
 

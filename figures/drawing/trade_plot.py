@@ -17,7 +17,13 @@ from full_geometry.trade.techniques import GATHERED
 from halfspace_sss.comparison.style import TEXT, TRACED, Look, look, paper, saved
 
 LEAST = 0.003  # smallest bias that is drawn; what is below lies there, an arrow down
-MARKERS = {"full_geometry": "P", "neural_shape": "X", "neural": "D", "neural_material": "d", TRACED: "*"}
+MARKERS = {"full_geometry": "P", "neural_shape": "X", "neural": "D", "neural_material": "d"}
+MARKERS |= {
+    TRACED: "*",
+    f"{TRACED}, precomputed": "h",
+    f"{TRACED}, denoised": "<",
+    f"{TRACED}, precomputed, denoised": ">",
+}
 
 
 def render(picture: TradePicture) -> dict[str, bytes]:

@@ -108,9 +108,9 @@ def _shipped() -> None:
     cells = []
     for row in rows:
         bias = "exact" if row.way == "path_traced" else NoiseFree(row.bias2, row.bias2_standard_error).told()
-        cost = (f"{row.variance:.3g}", f"{row.seconds_per_million:.3g}", f"{row.cost:.3g}", f"{row.flip:.3f}")
+        cost = (f"{row.variance:.3g}", f"{row.seconds_per_million:.3g}", f"{row.cost:.3g}")
         cells.append((row.material, row.shape, row.light, row.way, bias, *cost))
-    shared.say(shared.table(["material", "shape", "light", *HEADINGS, "FLIP"], cells, left=4))
+    shared.say(shared.table(["material", "shape", "light", *HEADINGS], cells, left=4))
     shared.say("measured by `python -m benchmarks figures all trade`; docs/trade.md says how")
 
 
