@@ -91,34 +91,25 @@ def glints_of(tracer: PathTracer, sensor: mi.Sensor, trial: int) -> Glints:
     film = PixelGrid.of(sensor)
     near = _near_mirrored(tracer, sensor, film)
     most = max(film.pixels // GLINTS, min(film.pixels // GLINTS_THERE, SMALL_IMAGE // GLINTS))
-    pixels, other, brightest = dr.arange(mi.UInt32, film.pixels), np.inf, np.inf
+
+    # Keep of all pixels, by few rays, those about which emission varies most or a small emitter may be mirrored.
+    pixels = dr.arange(mi.UInt32, film.pixels)
     dr.make_opaque(pixels)
-    # of all pixels by few rays those about which it varies most, or may; of these by more rays
-    for first, wide, kept in ((True, 5, CANDIDATES * most), (False, 3, most)):
-        more = min(max(TRIAL_RAYS * film.pixels // max(dr.width(pixels), 1), PLACES), MOST_PLACES)
-        rays = trial if first else 2 ** (more.bit_length() - 1)
-        numbers = path_numbers(seeded(0, 3, rays), dr.width(pixels), 0, rays)
-        places, weight = _rays(tracer, sensor, numbers, pixels)
-        light = mi.Spectrum(weight * tracer.seen_emission(places))
-        dr.eval(light)
-        # else no other light is asked for
-        if first and (tracer.visitor.small is not None or dr.any(dr.max(light) > 0)):
-            other, share = _other_light(tracer, sensor, film)
-            mirrored = np.linalg.norm([float(dr.mean(v)[0]) for v in light]) / max(share, 1 / LIT_RAYS)
-            brightest = BRIGHTEST * (np.sqrt(other) + mirrored) or np.inf
-        # variance by the pixels about each
-        light = [mi.Float64(v) for v in light]
-        moments = [*light, sum(v * v for v in light)]
-        moments = [film.scattered(dr.block_sum(v, rays) / rays, pixels) for v in moments]
-        variance = _variance(film.windowed(moments, wide))
-        if first:
-            variance, own = dr.select(near, dr.inf, variance), _variance(moments)
-        else:  # what few rays have met is not lost
-            variance = dr.maximum(variance, own)
-        pixels = _largest(variance, GLINT * other, kept)
-        if dr.width(pixels) == 0:
-            break
-    # with those that faces tell of
+    light = _emission(tracer, sensor, pixels, trial)
+    other, brightest = _limits(tracer, sensor, film, light)
+    moments = _moments(film, light, pixels, trial)
+    own, around = _variance(moments), _variance(film.windowed(moments, 5))
+    pixels = _largest(dr.select(near, dr.inf, around), GLINT * other, CANDIDATES * most)
+
+    # Keep of these, by more rays, as many as are wanted; what few rays have met is not lost.
+    if dr.width(pixels):
+        more = min(max(TRIAL_RAYS * film.pixels // dr.width(pixels), PLACES), MOST_PLACES)
+        rays = 2 ** (more.bit_length() - 1)
+        moments = _moments(film, _emission(tracer, sensor, pixels, rays), pixels, rays)
+        variance = dr.maximum(_variance(film.windowed(moments, 3)), own)
+        pixels = _largest(variance, GLINT * other, most)
+
+    # Join them with the pixels that faces tell of.
     on_faces, corners = _rectangles(tracer, sensor, film)
     found = np.union1d(np.array(pixels), on_faces).astype(np.uint32)
     low, high = np.zeros((len(found), 2)), np.ones((len(found), 2))
@@ -126,6 +117,34 @@ def glints_of(tracer: PathTracer, sensor: mi.Sensor, trial: int) -> Glints:
     low[at], high[at] = corners
     corners = of_rows(mi.Point2f, low), of_rows(mi.Point2f, high)
     return Glints(aligned(mi.UInt32, found), *corners, dr.opaque(mi.Float, float(brightest)))
+
+
+def _emission(tracer: PathTracer, sensor: mi.Sensor, pixels: mi.UInt32, rays: int) -> mi.Spectrum:
+    """Emission that so many rays of each pixel see in objects, evaluated."""
+    numbers = path_numbers(seeded(0, 3, rays), dr.width(pixels), 0, rays)
+    places, weight = _rays(tracer, sensor, numbers, pixels)
+    light = mi.Spectrum(weight * tracer.seen_emission(places))
+    dr.eval(light)
+    return light
+
+
+def _limits(
+    tracer: PathTracer, sensor: mi.Sensor, film: PixelGrid, light: mi.Spectrum
+) -> tuple[float, float]:
+    """Mean square of the other light of objects, and the brightest that a path may bring by chance; infinite where no
+    emission is seen. `light`: that rays of all pixels see."""
+    if tracer.visitor.small is None and not dr.any(dr.max(light) > 0):
+        return np.inf, np.inf
+    other, share = _other_light(tracer, sensor, film)
+    mirrored = np.linalg.norm([float(dr.mean(v)[0]) for v in light]) / max(share, 1 / LIT_RAYS)
+    return other, BRIGHTEST * (np.sqrt(other) + mirrored) or np.inf
+
+
+def _moments(film: PixelGrid, light: mi.Spectrum, pixels: mi.UInt32, rays: int) -> list[mi.Float64]:
+    """E[L_c] of each channel and E[Σ_c L_c²] of each pixel of the film."""
+    channels = [mi.Float64(v) for v in light]
+    moments = [*channels, sum(v * v for v in channels)]
+    return [film.scattered(dr.block_sum(v, rays) / rays, pixels) for v in moments]
 
 
 def _variance(moments: list[mi.Float64]) -> mi.Float64:

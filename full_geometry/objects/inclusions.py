@@ -299,7 +299,17 @@ def check_sensors(scene: mi.Scene, objects: list[Geometry], sensors: list[mi.Sen
         for b, each in enumerate(objects):
             # off a surface that the rays leave by a little of the size of an object
             if is_inside(each, _into(holders.to_world(b), o + 1e-4 * each.size * d)).any():
-                raise ValueError(f"the camera must be outside of every object, got it inside {each.name}")
+                near = _near_clip(sensor, each, holders.to_world(b))
+                raise ValueError(f"the camera must be outside of every object, got it inside {each.name}{near}")
+
+
+def _near_clip(sensor: mi.Sensor, obj: Geometry, to_world: np.ndarray) -> str:
+    """Words on the near_clip of a sensor that stands outside an object in which its rays begin, else nothing."""
+    if not isinstance(sensor, mi.ProjectiveCamera):
+        return ""
+    place = np.array(sensor.world_transform().translation(), dtype=float).reshape(3, 1)
+    inside = is_inside(obj, _into(to_world, place)).any()
+    return "" if inside else f", where its rays begin by near_clip = {sensor.near_clip():g}"
 
 
 def _rays(sensor: mi.Sensor) -> tuple[np.ndarray, np.ndarray]:

@@ -71,6 +71,11 @@ def test_a_sensor_inside_an_object_is_refused(integrator, sensor):
     assert refusal(make(integrator, sensor)) == "the camera must be outside of every object, got it inside 'ball'"
 
 
+def test_a_near_clip_that_lets_rays_begin_inside_an_object_is_named():
+    refused = refusal(make(INTEGRATORS[0], camera(30.0, FILM, near_clip=29.0)))
+    assert refused.endswith("got it inside 'ball', where its rays begin by near_clip = 29")
+
+
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_a_sensor_that_moves_into_an_object_or_stands_there_beside_the_scene_is_refused(integrator):
     scene, within = make(integrator, camera(30.0, FILM)), camera(1.0, FILM)
