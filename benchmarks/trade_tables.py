@@ -12,7 +12,7 @@ from figures.drawing.trade_plot import LEAST, NOISE, pareto, span_in_mfp, time_t
 from full_geometry.scenes.scene_files import PATH_TRACED
 from full_geometry.trade.advice import advise
 from full_geometry.trade.results import Assessment, ObjectTrade, TechniqueTrade
-from full_geometry.trade.techniques import Job
+from full_geometry.trade.techniques import Job, Technique
 from halfspace_sss.comparison.style import TEXT
 from halfspace_sss.noise_free import short
 
@@ -69,7 +69,7 @@ behind the object: the camera sees transmitted light. `path_traced` alone are wa
 |---|---|
 | bias | relative error of radiance, RMS over visible points and channels, without noise, ± standard error |
 | < x | bias lost in noise, below x in 95 % of cases |
-| cost | variance of a sample times its seconds: the time to a given noise |
+| cost | variance of a sample times its seconds: the time to a given noise; of denoised walks that to 1 % |
 | variance | without the brightest of 10⁴ samples, which filters take better than samples do |
 | seconds | of the processor, all cores together, without compilation |
 | – | open: {seconds:g} s for a scene and all techniques were too few |
@@ -115,13 +115,13 @@ def markdown(scenes: Scenes, seconds: float) -> str:
             option = advise(Assessment((o,), 0.0, 0.0, 0), Job(tolerance, images)).objects[0].options[0]
             told.append(f"{option.way} ({short(option.seconds)})")
         lines.append(f"| {' | '.join(scene)} | {' | '.join(told)} |")
-    lines += ["", "## Bias", "", "In %.", ""]
-    lines += _grid(scenes, lambda w, _: w.told_bias)
+    lines += ["", "## Bias", "", "In %. Denoised walks have none that more samples leave.", ""]
+    lines += _grid(scenes, lambda w, _: w.told_bias, lambda w: not Technique.of(w.way).denoised)
     lines += [
         "",
         "## Cost",
         "",
-        "Variance of a sample times seconds of a million samples, over path tracing's.",
+        "Time to 1 % of noise over that of `path_traced`.",
         "",
     ]
     lines += _grid(scenes, lambda w, o: f"{w.cost / o.traced.cost:.2g}")
@@ -132,13 +132,18 @@ def _job(tolerance: float, images: int) -> str:
     return f"{100 * tolerance:g} %" + (f", {images} images" if images > 1 else "")
 
 
-def _grid(scenes: Scenes, cell: Callable[[TechniqueTrade, ObjectTrade], str]) -> list[str]:
-    """A row for each technique but walks, of each material; a column for each shape and light."""
+def _grid(
+    scenes: Scenes, cell: Callable[[TechniqueTrade, ObjectTrade], str],
+    shown: Callable[[TechniqueTrade], bool] = lambda w: True,
+) -> list[str]:  # fmt: skip
+    """A row for each technique that is shown but plain walks, of each material; a column for each shape and light."""
     columns = list(dict.fromkeys(key[1:] for key in scenes))
     lines = ["| | " + " | ".join(map(", ".join, columns)) + " |", "|---|" + "---:|" * len(columns)]
     for material in dict.fromkeys(key[0] for key in scenes):
         mine = [scenes.get((material, *column)) for column in columns]
-        names = dict.fromkeys(w.way for o in mine if o for w in o.ways if not w.refusal and w.way != PATH_TRACED)
+        names = dict.fromkeys(
+            w.way for o in mine if o for w in o.ways if not w.refusal and w.way != PATH_TRACED and shown(w)
+        )
         for name in names:
             rows = [next((w for w in o.ways if w.way == name and not w.refusal), None) if o else None for o in mine]
             cells = ["–" if w is None or o is None else cell(w, o) for w, o in zip(rows, mine)]
