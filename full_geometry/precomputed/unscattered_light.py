@@ -330,7 +330,12 @@ def obstacle(media: WalkMedia) -> str:
 
 def holds_scattered(media: WalkMedia) -> bool:
     """Whether cells can hold scattered light: media are even in direction and in space and not of each walk, and no
-    light shines inside objects."""
+    light shines inside objects.
+
+    Where scattering is forward it does not pay: paths of light have five times the events at g = 0.8. To equal noise
+    of pixels images would take 0.6 of the time, of means over 8 x 8 pixels, which bind denoised images, 1.2 to 1.5
+    times (a ball of 100 mean free paths under windows).
+    """
     even = not (media.varies or media.carried) and not any(np.any(spec.medium.g) for spec in media.specs)
     return even and not (media.inner is not None and media.inner.shines)
 
