@@ -474,7 +474,7 @@ def test_a_medium_or_a_range_without_light_is_refused(medium: tuple, r: Any, mes
 def test_without_an_argument_the_shipped_table_is_shown() -> None:
     result = CliRunner().invoke(cli.app, ["trade"])
     assert result.exit_code == 0, result.stderr
-    assert all(word in result.stdout for word in ("marble", "exact", "< ")) and " 0 ±" not in result.stdout
+    assert all(word in result.stdout for word in ("marble", "exact", "< ", "corrected")) and " 0 ±" not in result.stdout
 
 
 def test_the_figure_and_the_page_are_drawn() -> None:
