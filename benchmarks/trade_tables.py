@@ -121,7 +121,7 @@ def markdown(scenes: Scenes, seconds: float) -> str:
         "",
         "## Cost",
         "",
-        "Time to 1 % of noise over that of `path_traced`.",
+        "Time to 1 % of noise over the time that `path_traced` takes.",
         "",
     ]
     lines += _grid(scenes, lambda w, o: f"{w.cost / o.traced.cost:.2g}")

@@ -13,7 +13,7 @@ from figures.computing.images import Shot, compared
 from figures.drawing.page import page
 from full_geometry.trade.images import TradePicture
 from full_geometry.trade.results import NOISE, Assessment, ObjectTrade, TechniqueTrade
-from full_geometry.trade.techniques import GATHERED
+from full_geometry.trade.techniques import CORRECTED, GATHERED
 from halfspace_sss.comparison.style import TEXT, TRACED, Look, look, paper, saved
 
 LEAST = 0.003  # smallest bias that is drawn; what is below lies there, an arrow down
@@ -80,7 +80,7 @@ def pareto(
     for row in rows:
         style, x, exact = _look(row.way), time_to_noise(row, pixels), row.way == TRACED
         y = LEAST if exact else max(row.bias, LEAST)
-        mark = "s" if row.way.endswith(GATHERED) else MARKERS.get(row.way, "o")
+        mark = {GATHERED: "s", CORRECTED: "^"}.get(row.way.rpartition(", ")[2]) or MARKERS.get(row.way, "o")
         size = (9 if exact else 5) * (0.7 if small else 1)
         (handle,) = ax.plot(
             x, y, mark, color=style.color, mfc=style.color, ms=size, mew=0.7 if small else 0.9,

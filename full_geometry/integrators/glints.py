@@ -128,9 +128,7 @@ def _emission(tracer: PathTracer, sensor: mi.Sensor, pixels: mi.UInt32, rays: in
     return light
 
 
-def _limits(
-    tracer: PathTracer, sensor: mi.Sensor, film: PixelGrid, light: mi.Spectrum
-) -> tuple[float, float]:
+def _limits(tracer: PathTracer, sensor: mi.Sensor, film: PixelGrid, light: mi.Spectrum) -> tuple[float, float]:
     """Mean square of the other light of objects, and the brightest that a path may bring by chance; infinite where no
     emission is seen. `light`: that rays of all pixels see."""
     if tracer.visitor.small is None and not dr.any(dr.max(light) > 0):
