@@ -299,16 +299,15 @@ def check_sensors(scene: mi.Scene, objects: list[Geometry], sensors: list[mi.Sen
         for b, each in enumerate(objects):
             # off a surface that the rays leave by a little of the size of an object
             if is_inside(each, _into(holders.to_world(b), o + 1e-4 * each.size * d)).any():
-                near = _near_clip(sensor, each, holders.to_world(b))
+                near = _near_clip(sensor, each, holders.to_world(b), o, d)
                 raise ValueError(f"the camera must be outside of every object, got it inside {each.name}{near}")
 
 
-def _near_clip(sensor: mi.Sensor, obj: Geometry, to_world: np.ndarray) -> str:
-    """Words on the near_clip of a sensor that stands outside an object in which its rays begin, else nothing."""
+def _near_clip(sensor: mi.Sensor, obj: Geometry, to_world: np.ndarray, o: np.ndarray, d: np.ndarray) -> str:
+    """Words on the near_clip of a sensor if rays that began without it, at o - near_clip d, were outside an object."""
     if not isinstance(sensor, mi.ProjectiveCamera):
         return ""
-    place = np.array(sensor.world_transform().translation(), dtype=float).reshape(3, 1)
-    inside = is_inside(obj, _into(to_world, place)).any()
+    inside = is_inside(obj, _into(to_world, o - sensor.near_clip() * d)).any()
     return "" if inside else f", where its rays begin by near_clip = {sensor.near_clip():g}"
 
 
