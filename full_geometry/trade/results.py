@@ -69,8 +69,9 @@ class TechniqueTrade:
 
     @property
     def is_exact(self) -> bool:
-        """Whether it has no bias: walks where no delta light shines, see `sampling.sample_blur`."""
-        return self.way == PATH_TRACED and self.bias2 == self.bias2_error == 0
+        """Whether it has no bias: walks with sampled light, denoised or not, where no delta light shines, see
+        `sampling.sample_blur`."""
+        return self.bias2 == self.bias2_error == 0
 
     @property
     def bias(self) -> float:

@@ -185,6 +185,10 @@ def test_a_square_that_noise_put_far_below_zero_keeps_no_tolerance_below_its_sta
     assert recommend(_assessment(lucky), tolerance=0.3).objects[0].way == "path_traced"
 
 
+def test_walks_with_sampled_light_are_told_as_exact_where_they_are_denoised_too() -> None:
+    assert trade._row(_way("path_traced, denoised", 0.0, 0.0, 1e-5))[1] == "exact"
+
+
 def test_a_bias_that_noise_hides_is_told_as_a_bound_and_never_as_0() -> None:
     lucky = TechniqueTrade("standard_dipole", -1e-3, 1e-4, (1.0,), (0.0,), 1.0, 0.0, 1e-9, 100)
     (walks, row), found = _assessment(lucky).objects[0].ways, _assessment(lucky)
