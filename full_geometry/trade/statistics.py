@@ -13,6 +13,8 @@ hundredth of all light. Variances of a sample are without them, as no assessment
 rid of them by filters rather than by samples. In biases they count as much as the next brightest sample, and what they
 carry beyond goes to all exits by their radiance: its mean is kept, where it belongs is not. The noise e of that mean,
 which all exits share, is taken from bias² like other noise and adds sqrt(2) e² and 2 e bias to its standard error.
+Fireflies may be most of the light of some exits and none of that of others: with m what an exit gained less what it
+lost, g² = Σ_k,c (m² - var m) / (n C) over (mean b)² adds g² and 2 g bias.
 """
 
 from __future__ import annotations
@@ -109,28 +111,40 @@ class RadianceEstimate:
     def steady(self) -> SteadyMean:
         """The mean whose fireflies are shared by all exits."""
         channels, n = self.first.shape
-        rest, mean, shared = RadianceEstimate(channels, n), np.empty((channels, n)), np.zeros(channels)
+        rest, mean = RadianceEstimate(channels, n), np.empty((channels, n))
+        shared, moved = np.zeros(channels), np.zeros((channels, n))
         rest.add(self.first, self.second, self.samples)
         for c in range(channels):
             values, exits, limit = self._fireflies(c)
             np.subtract.at(rest.first[c], exits, values - limit)
             np.subtract.at(rest.second[c], exits, values**2 - limit**2)
-            shared[c] = (((values - limit) / max(self.first[c].sum(), 1e-300)) ** 2).sum()
+            beyond, light = (values - limit) / max(self.samples, 1), max(self.mean[c].sum(), 1e-300)
+            shared[c] = ((beyond / light) ** 2).sum()
             mean[c] = rest.mean[c] * self.first[c].sum() / max(rest.first[c].sum(), 1e-300)
-        return SteadyMean(mean, rest.variance, shared)
+            moved[c] = (mean[c] - self.mean[c]) ** 2
+            np.subtract.at(moved[c], exits, beyond**2)
+        return SteadyMean(mean, rest.variance, shared, moved)
 
 
 class SteadyMean(NamedTuple):
-    """Means of exits, (channels, n), with the noise of each alone, and the relative noise of all, (channels,)."""
+    """Means of exits, (channels, n), with the variance of each alone, the relative variance of all, (channels,), and
+    the squares of what sharing fireflies added to each, less their noise."""
 
     mean: np.ndarray
     variance: np.ndarray
     shared: np.ndarray
+    moved: np.ndarray
 
     @property
     def noise(self) -> np.ndarray:
         """Variance of the mean at each exit."""
         return self.variance + self.shared[:, None] * self.mean**2
+
+    @property
+    def displacement(self) -> float:
+        """Mean square of what sharing fireflies moved, one standard error above its estimate, over that of radiance."""
+        found = _ratio(self.moved.mean(axis=0), self.mean.mean(axis=0), 2)
+        return max(found.value + found.error, 0.0) if np.isfinite(found.error) else 0.0
 
 
 def mean_square(parts: Sequence[RadianceEstimate], walks: Sequence[RadianceEstimate], kept: float = 0.0) -> Number:
@@ -160,9 +174,10 @@ def _variance_between(one: SteadyMean, two: SteadyMean) -> np.ndarray:
 
 
 def _with_shared(found: Number, *noisy: SteadyMean) -> Number:
-    """With the error of noise that all exits share."""
-    e2 = sum(float(each.shared.mean()) for each in noisy)
-    return Number(found.value, float(np.sqrt(found.error**2 + 2 * e2**2 + 4 * max(found.value, 0.0) * e2)))
+    """With the errors of noise that all exits share and of light that fireflies moved between them."""
+    e2, g2 = (sum(values) for values in zip(*((float(each.shared.mean()), each.displacement) for each in noisy)))
+    beside = 2 * e2**2 + g2**2 + 4 * max(found.value, 0.0) * (e2 + g2)
+    return Number(found.value, float(np.sqrt(found.error**2 + beside)))
 
 
 def mean_square_of(difference: RadianceEstimate, b: RadianceEstimate) -> Number:
