@@ -61,7 +61,8 @@ JOBS = ((0.02, 1), (0.05, 1), (0.05, 100), (0.1, 1), (0.2, 1))  # tolerance, ima
 INTRODUCTION = """\
 # Speed against accuracy on scenes
 
-`python -m benchmarks figures all trade` makes these tables, the figure and the data that `halfspace-sss trade` shows.
+`python -m benchmarks figures all trade --quality paper` makes these tables, the figure and the data that
+`halfspace-sss trade` shows.
 The bunny is 37 mm tall; the spikes, a ball with bumps and thorns, are about as large across. The small light stands
 behind the object: the camera sees transmitted light. `path_traced` alone are walks with sampled light.
 
