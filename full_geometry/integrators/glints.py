@@ -7,8 +7,8 @@ smaller. In a rectangle about the latter lie half of the places, with MIS weight
 
     L = Σ_j f(x_j) / (N q(x_j)),    q = 1/2 + 1/2 [x in the rectangle] / area.
 
-In all other pixels, what few paths find of emitters is cut (`PathTracer`): a bias that is less than a thousandth of the
-light, in place of pixels that no number of samples brings to their mean.
+In all other pixels, what few paths find of emitters is cut (`PathTracer`): mostly less than a thousandth of the light,
+in place of pixels that no number of samples brings to their mean.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ PLACES, MOST_PLACES, SHARE = 32, 1024, 4  # least and most in each, for a sample
 NEAR = 1.5  # steps from pixel to pixel, within which what they mirror may be a rim
 FEWEST_TRIALS, TRIALS, SEARCH = 4, 64, 2**20  # rays through each pixel that find them, if so few; through all
 TRIAL_RAYS = 2  # through candidates, for each pixel of the image
-LIT_RAYS = 2**13  # that tell the light
+LIT_RAYS, FORWARD_LIT_RAYS = 2**13, 2**16  # that tell the light; where a lamp behind forward scattering has much of it
 SMALLEST = 0.01  # edge of a rectangle, pixels
 BRIGHTEST = 64.0  # times the RMS of the other light of objects and the mean of the emission seen in them
 
@@ -134,7 +134,7 @@ def _limits(tracer: PathTracer, sensor: mi.Sensor, film: PixelGrid, light: mi.Sp
     if tracer.visitor.small is None and not dr.any(dr.max(light) > 0):
         return np.inf, np.inf
     other, share = _other_light(tracer, sensor, film)
-    mirrored = np.linalg.norm([float(dr.mean(v)[0]) for v in light]) / max(share, 1 / LIT_RAYS)
+    mirrored = np.linalg.norm([float(dr.mean(v)[0]) for v in light]) / max(share, 1 / FORWARD_LIT_RAYS)
     return other, BRIGHTEST * (np.sqrt(other) + mirrored) or np.inf
 
 
@@ -254,10 +254,11 @@ def _near_mirrored(tracer: PathTracer, sensor: mi.Sensor, film: PixelGrid) -> mi
 
 def _other_light(tracer: PathTracer, sensor: mi.Sensor, film: PixelGrid) -> tuple[float, float]:
     """The mean square of the light of objects without the emission seen in them, and the share of rays with any."""
-    pixels = aligned(mi.UInt32, np.linspace(0, film.pixels - 1, LIT_RAYS).astype(np.uint32))
-    rays, weight = _rays(tracer, sensor, path_numbers(seeded(0, 2), LIT_RAYS, 0, 1), pixels)
-    apart = dr.opaque(mi.Bool, True, LIT_RAYS)
+    n = FORWARD_LIT_RAYS if tracer.visitor.forward else LIT_RAYS
+    pixels = aligned(mi.UInt32, np.linspace(0, film.pixels - 1, n).astype(np.uint32))
+    rays, weight = _rays(tracer, sensor, path_numbers(seeded(0, 2), n, 0, 1), pixels)
+    apart = dr.opaque(mi.Bool, True, n)
     tracer = replace(tracer, apart=apart, brightest=dr.opaque(mi.Float, np.inf))  # the kernel of the image
     L, hit, _ = tracer.trace(rays, on_device(PATH_LANES), (0, 2))
     light = np.array(weight * L, dtype=float)[:, np.array(hit)]
-    return float((light**2).sum() / max(light.shape[1], 1)), light.shape[1] / LIT_RAYS
+    return float((light**2).sum() / max(light.shape[1], 1)), light.shape[1] / n

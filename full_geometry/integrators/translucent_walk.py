@@ -156,7 +156,8 @@ def _class(variant: str) -> type:
                     ends = holds_scattered(media) and inner is None and self.max_depth == FOREVER and not exits
                     light = unscattered_light(scene, media, seed, self._cells[1], image, fewest, ends)
                     self.filling = clock() - started
-                connections, directions, straight = None, None, None
+                connections, straight = None, None
+                directions = find_directions(scene, media, small, self.connection_share) if light.forward else None
 
             # ---- or sampled: connections with small emitters, directions to them, straight light
             else:

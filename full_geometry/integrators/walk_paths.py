@@ -53,6 +53,7 @@ from halfspace_sss.tracing.walk import generator, pass_seed
 ALONG = 3  # events that are looked up along a flight, a multiple of the channels
 MIRRORS = 2  # of objects, one in the other, in which the first surface of a path finds emission
 LEAST_SEEN = 1e-3  # transmittance, below which emission behind an object is left to chance
+LEAST_FORWARD = 0.1  # share of forward events alone, from which directions to small emitters are drawn
 REFLECTIONS, LEAST_REFLECTED = 6, 0.01  # inside an object, of what is seen through it; throughput that is followed
 
 # ---- Loop state ------------------------------------------------------------------------------------------------------
@@ -144,14 +145,16 @@ class LightVisitor:
 
     Args:
         connections: of events with light subpaths of small emitters, if there are any.
-        directions: from events to small emitters, where connections cannot find their light.
+        directions: from events to small emitters, where connections cannot find their light, or after forward events
+            alone where it is precomputed.
         straight_light: of emitters through boundaries of index 1, if there are any.
         inner_lights: delta lights inside objects, if there are any.
         blur: scale of the cones over which delta lights outside are spread; 0 leaves their light out.
-        unscattered: light that events find precomputed, in place of connections, directions and straight light.
+        unscattered: light that events find precomputed, in place of connections and straight light.
         outgoing: deep light of objects, of paths inside that begin with two scattering events, known where they go in.
         deep: whether that light alone counts, of the object that a path meets first.
         reflections: whether emission behind objects is found after reflections inside, too.
+        brightest: most that a direction to an emitter brings after forward events, as of `PathTracer`.
     """
 
     scene: mi.Scene
@@ -166,6 +169,7 @@ class LightVisitor:
     outgoing: OutgoingLight | None = None
     deep: bool = False
     reflections: bool = False
+    brightest: mi.Float | None = None
 
     @property
     def splits(self) -> bool:
@@ -276,6 +280,9 @@ class LightVisitor:
                 run = ForwardRun(share, mi.Vector3f(event.along), mi.Spectrum(event.m.g), mi.Bool(True))
                 record = replace(record, run=run)
             record = replace(record, L=record.L + dr.select(counts, L, 0), precomputed=mi.Bool(True))
+            if self.directions is not None and self.forward and not self.splits:
+                lit = counts & (dr.max(record.run.share) > LEAST_FORWARD) & (dr.max(dr.abs(record.run.g)) > 0)
+                walk, record = self._directed(walk, record, event, lit)
             return walk, record, mi.Spectrum(0)
 
         # ---- emitters behind boundaries of index 1: L += throughput p L_e T / p_e  p_e / (p_e + p)
@@ -292,12 +299,16 @@ class LightVisitor:
             connected = record.connected
         met = record.L - L
 
-        # ---- directions to emitters, where no connection finds their light, with MIS weights against phase sampling
-        directed = self.directions.leads(walk.object) & ~connected & self.media.counts(walk.object, walk.order + 1)
+        return *self._directed(walk, record, event, ~connected & self.media.counts(walk.object, walk.order + 1)), met
+
+    def _directed(self, walk: Walk, record: LightRecord, event: Event, lit: mi.Bool) -> tuple[Walk, LightRecord]:
+        """The walk and its record with light of emitters along directions to them, by MIS weights against phase
+        sampling. `lit`: whether nothing else finds it."""
+        directed = self.directions.leads(walk.object) & lit
         record = replace(record, straight=mi.Bool(True), directed=directed)
         walk, record, _ = dr.if_stmt((walk, record, event), directed, self._direct, _same_state, label="directions")
         departure = Departure(event.p, event.along, record.departure.ahead, walk.object)
-        return walk, replace(record, departure=departure), met
+        return walk, replace(record, departure=departure)
 
     def _connected(self, walk: Walk, record: LightRecord, event: Event) -> tuple[Walk, LightRecord]:
         """The walk and its record with light of connections.
@@ -335,7 +346,11 @@ class LightVisitor:
         return walk, _plus(record, walk, *self.straight_light.light(event, walk.rng)), event
 
     def _direct(self, walk: Walk, record: LightRecord, event: Event) -> tuple[Walk, LightRecord, Event]:
-        return walk, _plus(record, walk, *self.directions.light(event, walk.rng)), event
+        # L += throughput share(d) p(d) T L_e / p_d, of which the forward share alone is not precomputed
+        if not self.forward:
+            return walk, _plus(record, walk, *self.directions.light(event, walk.rng)), event
+        light, _ = self.directions.light(event, walk.rng, lambda d: record.run.onward(d).share)
+        return walk, replace(record, L=record.L + _bounded(walk.weight * light, self.brightest)), event
 
     def boundary(
         self, walk: Walk, record: LightRecord, si: mi.SurfaceInteraction3f, active: mi.Bool
@@ -599,18 +614,17 @@ class LightVisitor:
         which = mi.Int32(draw(n, walk.rng)) if n > 1 else dr.zeros(mi.Int32, dr.width(walk.o))
         left = self.left(record)
         active = active & record.scattered & record.delta & (dr.max(dr.abs(left)) > 0)
-        directed = mi.Bool(False)
         if self.connections is not None:
             w_0, _ = self.small.direction(which, walk.o)
             emitter = walk.o + w_0 * opaque(dr.norm(self.scene.bbox().extents()))
             active &= ~(record.connected & self.connections.covers(which, emitter, w_0, record.pivot))
-            directed = active & record.directed
+        directed = active & record.directed if self.directions is not None else mi.Bool(False)
 
         # ---- n E / Ω within the cone, which is narrow where directions to emitters share the light
         radius = dr.select(directed, NARROW, opaque(WIDE * self.blur))
         ray = ray_of(walk.o, walk.d, walk.medium)
         L = self.small.spread(which, ray, radius, active)
-        if self.connections is not None:
+        if self.directions is not None:
             directed &= dr.max(L) > 0
             L = L * self._against_directions(which, record.departure, walk.medium, mi.Float(1), directed)
         return dr.select(active, walk.weight * L * n * left, 0)
@@ -639,6 +653,11 @@ class LightVisitor:
         u = mi.Point2f(walk.rng.next_float32(), walk.rng.next_float32())
         rays = self.media.instance_scene
         return walk.weight * next_event(self.scene, rays, (si, bsdf), u, active, outwards, share=share)
+
+
+def _bounded(light: mi.Spectrum, most: mi.Float | None) -> mi.Spectrum:
+    """Light in its own colour, its largest channel at most so large."""
+    return light if most is None else light * dr.minimum(1, most / dr.maximum(dr.max(light), 1e-30))
 
 
 def _same_state(*state: object) -> tuple:
@@ -717,10 +736,10 @@ class PathTracer:
         L, hit = dr.zeros(mi.Spectrum, n), dr.zeros(mi.Bool, n)
         emission = dr.zeros(mi.Spectrum, n if self.layers else 1)
         dr.eval(L, hit, emission)
-        media, visitor = self.visitor.media, FirstExitVisitor(self.visitor, exits) if exits else self.visitor
+        media, visitor = self.visitor.media, replace(self.visitor, brightest=self.brightest)
         scorer = ScoreVisitor(self.visitor, media, scores) if scores else None
         ahead = self.visitor.flight if self.visitor.ahead and not self.visitor.deep else None
-        walker = Walker(media, scorer or visitor, ahead=ahead)
+        walker = Walker(media, scorer or (FirstExitVisitor(visitor, exits) if exits else visitor), ahead=ahead)
         total, step = (dr.opaque(mi.UInt32, v) for v in (n, lanes))  # kernels then serve images of any size
 
         # ---- the parts of an iteration
@@ -820,7 +839,7 @@ class PathTracer:
         # ---- emission: L += throughput L_e p_f / (p_f + p_e)
         first = p.depth == 0
         shown = ~first if self.hide_emitters else mi.Bool(True)
-        L_e = self._cut(self.visitor.met_emitter(p.walk, p.light, si, shown), p)
+        L_e = self._cut(self.visitor.met_emitter(p.walk, p.light, si, shown), p, p.light.delta)
         if self.layers:
             p = replace(p, emission=p.emission + dr.select(first, L_e, 0))
         L = p.light.L + L_e
@@ -960,13 +979,14 @@ class PathTracer:
             return before
         return before | (walk.order > 0 if self.visitor.unscattered.clear else True)
 
-    def _cut(self, light: mi.Spectrum, p: CameraPath) -> mi.Spectrum:
+    def _cut(self, light: mi.Spectrum, p: CameraPath, delta: mi.Bool | bool = True) -> mi.Spectrum:
         """Light of emitters at most as bright as `brightest`, in its own colour, where few paths meet small ones: once
-        a path has come out of an object, or two have mirrored it."""
+        a path has come out of an object, or two have mirrored it. `delta`: whether the last vertex had one direction
+        alone, as where others have sampled emitters MIS weights bound it."""
         if self.brightest is None:
             return light
-        rare = p.passed | (p.mirrored & (p.depth >= MIRRORS))
-        return dr.select(rare, light * dr.minimum(1, self.brightest / dr.maximum(dr.max(light), 1e-30)), light)
+        rare = (p.passed | (p.mirrored & (p.depth >= MIRRORS))) & delta
+        return dr.select(rare, _bounded(light, self.brightest), light)
 
 
 def _along_mirror(

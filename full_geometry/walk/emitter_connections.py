@@ -18,6 +18,7 @@ reflect, emitters that look large from v_k, or directions at a large angle to w_
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -371,8 +372,11 @@ class EmitterDirections:
         alpha = dr.gather(mi.Float, self.alpha, self.media.place_of(k))
         return dr.square((self.media.row("eta", k) - 1) * alpha)
 
-    def light(self, event: Event, rng: mi.PCG32) -> tuple[mi.Spectrum, Score | tuple[()]]:
-        """An estimate of the light of small emitters that leaves from an event, per weight of the walk; its slopes."""
+    def light(
+        self, event: Event, rng: mi.PCG32, left: Callable[[mi.Vector3f], mi.Spectrum] | None = None
+    ) -> tuple[mi.Spectrum, Score | tuple[()]]:
+        """An estimate of the light of small emitters that leaves from an event, per weight of the walk; its slopes.
+        `left`: the share of light along a direction that counts; all by default."""
         # ---- one of n emitters, and a direction d about the guessed one
         v, k, m = event.p, event.object, event.m
         n = len(self.small)
@@ -398,7 +402,7 @@ class EmitterDirections:
             state = (arriving, which, k, si, choice, u)
             rough = valid & self.media.scatters_at(k)
             arriving, *_ = dr.if_stmt(state, rough, self._through_rough, lambda *state: state, label="rough")
-        light = value * arriving
+        light = value * arriving if left is None else value * arriving * left(d)
         if not self.scored:
             return light, ()
         cosine = dr.dot(event.along, d)

@@ -342,6 +342,43 @@ def test_precomputed_light_of_a_lamp_has_the_mean_of_sampled_light_where_scatter
         _compare({**MEDIUM, "g": 0.9}, 0.02, _ball(2.0), spp=6144, fewer=3, runs=8, **lamp)
 
 
+def _behind(seeds: int, chance: bool = False, cut: bool = False) -> np.ndarray:
+    """Mean light (seeds, 3) of a ball of a forward medium with a small lamp behind it, of whose light few paths of the
+    same rays leave the ball towards it by chance."""
+    from full_geometry.integrators.glints import glints_of
+    from full_geometry.precomputed.unscattered_light import ImageSamples
+
+    lamp = {"type": "sphere", "center": [-14, 9, -20], "radius": 1.5, "emitter": {"type": "area", "radiance": 200.0}}
+    surface = {"sigma_s": "2.0,3.0,4.0", "sigma_a": "0.05,0.1,0.3", "eta": 1.4, "g": 0.9}
+    scene = _scene("precomputed", surface, _ball(3.0), lamp=lamp)
+    places = np.random.default_rng(1).random((2, 2**17), dtype=np.float32)
+    rays, _ = scene.sensors()[0].sample_ray(0.0, 0.5, mi.Point2f(*map(mi.Float, places)), mi.Point2f(0.5))
+    found = []
+    with dr.suspend_grad():
+        for seed in range(seeds):
+            tracer = scene.integrator().tracer(scene, seed, ImageSamples(2**14, 64))
+            assert tracer.visitor.forward and tracer.visitor.directions is not None
+            if chance:
+                tracer = replace(tracer, visitor=replace(tracer.visitor, directions=None))
+            most = glints_of(tracer, scene.sensors()[0], 4).brightest if cut else dr.opaque(mi.Float, np.inf)
+            light, hit, _ = replace(tracer, brightest=most).trace(rays, 2**12, (seed, 1))
+            found.append(np.array(light)[:, np.array(hit)].mean(axis=1))
+    return np.array(found)
+
+
+@pytest.mark.slow
+def test_directions_to_a_lamp_after_forward_events_have_the_mean_of_chance() -> None:
+    found, wanted = _behind(6), _behind(16, chance=True)
+    error = np.hypot(*(x.std(axis=0, ddof=1) / np.sqrt(len(x)) for x in (found, wanted)))
+    assert (error < 0.05 * wanted.mean(axis=0)).all(), error / wanted.mean(axis=0)
+    assert (np.abs(found.mean(axis=0) - wanted.mean(axis=0)) < WIDEST_Z * error).all()
+
+
+@pytest.mark.slow
+def test_a_small_lamp_behind_a_forward_medium_loses_little_light_to_the_cut() -> None:
+    assert (_behind(4, cut=True) > 0.98 * _behind(4)).all()
+
+
 @pytest.mark.slow
 def test_light_of_a_window_has_a_fraction_of_the_noise_of_sampled_light() -> None:
     sky = np.full((32, 64, 3), 0.1, dtype=np.float32)
