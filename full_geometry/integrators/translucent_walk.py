@@ -156,8 +156,9 @@ def _class(variant: str) -> type:
                     ends = holds_scattered(media) and inner is None and self.max_depth == FOREVER and not exits
                     light = unscattered_light(scene, media, seed, self._cells[1], image, fewest, ends)
                     self.filling = clock() - started
-                connections, straight = None, None
-                directions = find_directions(scene, media, small, self.connection_share) if light.forward else None
+                connections, directions, straight = None, None, None
+                if light.forward and not self.ends:
+                    directions = find_directions(scene, media, small, self.connection_share)
 
             # ---- or sampled: connections with small emitters, directions to them, straight light
             else:

@@ -280,7 +280,7 @@ class LightVisitor:
                 run = ForwardRun(share, mi.Vector3f(event.along), mi.Spectrum(event.m.g), mi.Bool(True))
                 record = replace(record, run=run)
             record = replace(record, L=record.L + dr.select(counts, L, 0), precomputed=mi.Bool(True))
-            if self.directions is not None and self.forward and not self.splits:
+            if self.directions is not None:  # which go with forward events alone
                 lit = counts & (dr.max(record.run.share) > LEAST_FORWARD) & (dr.max(dr.abs(record.run.g)) > 0)
                 walk, record = self._directed(walk, record, event, lit)
             return walk, record, mi.Spectrum(0)
