@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import numbers
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from halfspace_sss.checks import check_choice, check_count, check_flag, check_interval
 
@@ -117,6 +118,22 @@ def variant_channels() -> int:
     if variant not in VARIANTS:
         raise ValueError(f"variant must be llvm_ad_ or cuda_ad_ with rgb, mono or spectral, got {variant!r}")
     return CHANNELS[variant.rpartition("_")[2]]
+
+
+R = TypeVar("R")
+
+
+def per_variant(make: Callable[[], R]) -> Callable[[], R]:
+    """What `make` makes under the current variant of Mitsuba, such as a class of a plugin; once for each variant."""
+    made = functools.cache(lambda variant: make())
+
+    @functools.wraps(make)
+    def current() -> R:
+        import mitsuba as mi
+
+        return made(mi.variant())
+
+    return current
 
 
 def check_variant() -> None:

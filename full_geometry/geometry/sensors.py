@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 
 import drjit as dr
@@ -11,6 +10,7 @@ import numpy as np
 
 from full_geometry.geometry.instances import InstanceScene
 from full_geometry.geometry.rounding import ray_from
+from full_geometry.settings import per_variant
 
 
 def sampled_size(film: mi.Film) -> mi.ScalarVector2u:
@@ -155,12 +155,11 @@ def path_numbers(seed: int, pixels: int, first: int, spp: int) -> mi.Sampler:
     """Numbers for the samples from `first` on of each pixel, beside each other.
     `seed`: images of different seeds are independent. `first`: number of the first sample of a pixel; those before it
     have been taken."""
-    return _numbers_class(mi.variant())(seed, pixels, first, spp)
+    return _numbers_class()(seed, pixels, first, spp)
 
 
-@functools.cache
-def _numbers_class(variant: str) -> type:
-    """The class of a variant, which must be the current one."""
+@per_variant
+def _numbers_class() -> type:
 
     class PathNumbers(mi.Sampler):
         """A sampler with the number of what it gives next as state."""

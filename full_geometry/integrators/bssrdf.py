@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import gc
 import math
 from collections.abc import Collection, Iterator
@@ -32,7 +31,7 @@ from full_geometry.integrators.surface_paths import replay_paths, trace_paths
 from full_geometry.objects.inclusions import check_sensors
 from full_geometry.objects.objects import KnowsUnit, TranslucentObject
 from full_geometry.objects.small_emitters import check_emitters, check_sampled
-from full_geometry.settings import GATHERED_LIGHTS, LAYER, Choices, Settings, read_settings
+from full_geometry.settings import GATHERED_LIGHTS, LAYER, Choices, Settings, per_variant, read_settings
 from full_geometry.surface.translucent import is_translucent
 from full_geometry.surface.wrapped import wraps
 from full_geometry.transport.prepare import Chooser, TranslucentObjects, choices_of, make_objects
@@ -45,19 +44,14 @@ GEOMETRY = ("to_world", mesh.POSITIONS, mesh.NORMALS, mesh.TEXCOORDS)
 # ---- The plugin -----------------------------------------------------------------------------------------------------
 
 
-def integrator_class() -> type:
-    """The class of the integrator for the current variant of Mitsuba."""
-    return _class(mi.variant())
-
-
 def is_bssrdf(integrator: mi.Integrator | None) -> bool:
     """Whether an integrator is `bssrdf`, which has settings and makes models of objects before it renders."""
     return isinstance(integrator, integrator_class())
 
 
-@functools.cache
-def _class(variant: str) -> type:
-    """The class of a variant, which must be the current one."""
+@per_variant
+def integrator_class() -> type:
+    """The class of the integrator for the current variant of Mitsuba."""
 
     @KnowsUnit.register
     class BSSRDFIntegrator(mi.SamplingIntegrator):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
@@ -37,7 +36,15 @@ from full_geometry.precomputed.unscattered_light import (
     obstacle,
     unscattered_light,
 )
-from full_geometry.settings import LAYER, MM_PER_UNIT, OF_MITSUBA, WALK_LIGHTS, check_depth, check_parameters
+from full_geometry.settings import (
+    LAYER,
+    MM_PER_UNIT,
+    OF_MITSUBA,
+    WALK_LIGHTS,
+    check_depth,
+    check_parameters,
+    per_variant,
+)
 from full_geometry.surface.textured import shown
 from full_geometry.surface.varying import equivalent
 from full_geometry.surface.wrapped import surface_of
@@ -60,14 +67,9 @@ WIDEST = 20.0  # blur: 1 and 3 radians
 Keep = Callable[[FirstExits], None]
 
 
+@per_variant
 def walk_integrator_class() -> type:
     """The class of the integrator for the current variant of Mitsuba."""
-    return _class(mi.variant())
-
-
-@functools.cache
-def _class(variant: str) -> type:
-    """The class of a variant, which must be the current one."""
 
     @KnowsUnit.register
     class TranslucentWalk(mi.SamplingIntegrator):

@@ -21,7 +21,7 @@ from scipy.interpolate import CubicSpline
 
 from full_geometry.geometry.points import floats, opaque
 from full_geometry.geometry.shape import name_of
-from full_geometry.settings import check_parameters
+from full_geometry.settings import check_parameters, per_variant
 from full_geometry.surface.textured import TexturedMedium
 from full_geometry.surface.translucent import PARAMETERS, boundary_of, is_smooth_boundary, number_of, read_medium_spec
 from halfspace_sss.arrays import library
@@ -196,11 +196,6 @@ def _mean_decay(x: mi.Float) -> mi.Float:
     return dr.select(x < 1e-6, 1, -library(x).expm1(-x) / dr.maximum(x, 1e-6))
 
 
-def sheet_class() -> type:
-    """The class of thin walls for the current variant of Mitsuba."""
-    return _class(mi.variant())
-
-
 def is_sheet(bsdf: mi.BSDF | None) -> bool:
     """Whether a BSDF is a thin wall, or holds one."""
     return bsdf is not None and any(isinstance(node, sheet_class()) for node in mi.traverse(bsdf).hierarchy)
@@ -219,9 +214,9 @@ def check_sheets(shapes: list[mi.Shape], mm_per_unit: float) -> None:
                     )
 
 
-@functools.cache
-def _class(variant: str) -> type:
-    """The class of a variant, which must be the current one."""
+@per_variant
+def sheet_class() -> type:
+    """The class of thin walls for the current variant of Mitsuba."""
 
     class TranslucentSheet(mi.BSDF):
         """A slab without extent, seen from both sides."""

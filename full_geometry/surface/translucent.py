@@ -48,7 +48,6 @@ serve media of any index.
 
 from __future__ import annotations
 
-import functools
 import math
 import re
 import warnings
@@ -62,7 +61,7 @@ import numpy as np
 
 from full_geometry.geometry.points import mirrored, opaque
 from full_geometry.geometry.snapshot import held
-from full_geometry.settings import ORDERS, check_parameters, variant_channels
+from full_geometry.settings import ORDERS, check_parameters, per_variant, variant_channels
 from full_geometry.surface.layered import LayeredMedium, read_layers
 from full_geometry.surface.spectral import EVERYWHERE, MediumByWavelength, read_file, spectral_medium
 from full_geometry.surface.textured import TexturedMedium, constant_texture, textured_medium
@@ -89,17 +88,16 @@ def smooth_boundary(eta: float) -> mi.BSDF:
     """
     props = mi.Properties("smooth_boundary")
     props["eta"] = float(eta)
-    return _boundary_class(mi.variant())(props)
+    return _boundary_class()(props)
 
 
 def is_smooth_boundary(boundary: mi.BSDF) -> bool:
     """Whether a boundary is one of `smooth_boundary`."""
-    return isinstance(boundary, _boundary_class(mi.variant()))
+    return isinstance(boundary, _boundary_class())
 
 
-@functools.cache
-def _boundary_class(variant: str) -> type:
-    """The class of a variant, which must be the current one."""
+@per_variant
+def _boundary_class() -> type:
 
     class SmoothBoundary(mi.BSDF):
         """Reflection by Fresnel's equations, and refraction into the cone by Snell's law."""
@@ -286,19 +284,14 @@ VARIABLE = ("albedo", "sigma_t", "g")  # by which light can be differentiated
 ALBEDOS, COSINES = 65, 9  # of tables of the directional albedo
 
 
-def translucent_class() -> type:
-    """The class of the surface for the current variant of Mitsuba."""
-    return _class(mi.variant())
-
-
 def is_translucent(bsdf: mi.BSDF | None) -> bool:
     """Whether a BSDF is a `translucent` surface, with a `MediumSpec` as its `spec`."""
     return isinstance(bsdf, translucent_class())
 
 
-@functools.cache
-def _class(variant: str) -> type:
-    """The class of a variant, which must be the current one."""
+@per_variant
+def translucent_class() -> type:
+    """The class of the surface for the current variant of Mitsuba."""
 
     class Translucent(mi.BSDF):
         """The reflection of the boundary as a BSDF; `spec` says what is below.

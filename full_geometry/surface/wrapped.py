@@ -15,7 +15,6 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -25,6 +24,7 @@ import mitsuba as mi
 from full_geometry.geometry.points import EntrySample, turned
 from full_geometry.geometry.shape import Geometry, name_of
 from full_geometry.geometry.snapshot import held
+from full_geometry.settings import per_variant
 from full_geometry.surface.translucent import is_translucent
 
 BENDS = {"NormalMap": "normalmap", "BumpMap": "bumpmap"}
@@ -116,13 +116,9 @@ class Wrapping:
             self.surface.asked = None
 
 
+@per_variant
 def nothing() -> mi.BSDF:
     """The BSDF that lets all light pass."""
-    return _nothing(mi.variant())
-
-
-@functools.cache
-def _nothing(variant: str) -> mi.BSDF:
     return mi.load_dict({"type": "null"})
 
 
