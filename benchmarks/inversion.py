@@ -16,10 +16,10 @@ import mitsuba as mi
 import numpy as np
 
 from benchmarks.inversion_textures import rms
+from benchmarks.mitsuba_media import with_media
 from figures.parts.part import Row, SceneDict
 from full_geometry import inverse
 from full_geometry.inverse.views import GivenView
-from full_geometry.scenes.mitsuba_scene import with_media
 from halfspace_sss.progress import NamedProgress, ProgressText
 
 CASES: Mapping[str, Mapping[str, float]] = {

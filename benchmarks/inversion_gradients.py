@@ -17,8 +17,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from benchmarks.mitsuba_media import with_media
 from figures.computing.scans import SCANS, scan_scene
-from full_geometry.scenes.mitsuba_scene import with_media
 from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
 from halfspace_sss.progress import NamedProgress
 

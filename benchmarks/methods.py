@@ -69,7 +69,7 @@ def ready(
 
 
 def _volume_scene(description: SceneDict, name: str, medium: Medium, rr_depth: int) -> mi.Scene | tuple[mi.Scene, ...]:
-    from full_geometry.scenes.mitsuba_scene import with_media
+    from benchmarks.mitsuba_media import with_media
 
     integrator = {"type": _VOLUME, "max_depth": -1, "rr_depth": rr_depth, "hide_emitters": True}
     mm_per_unit = description["integrator"].get("mm_per_unit", 1.0)

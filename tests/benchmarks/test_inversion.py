@@ -7,7 +7,7 @@ import pytest
 
 mi = pytest.importorskip("mitsuba")
 from benchmarks import inversion, inversion_textures  # noqa: E402
-from full_geometry.scenes.mitsuba_scene import with_media  # noqa: E402
+from benchmarks.mitsuba_media import with_media  # noqa: E402
 from full_geometry.scenes.scene_files import PATH_TRACED, open_scene  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("quiet_rgb")

@@ -18,6 +18,7 @@ mi = pytest.importorskip("mitsuba")
 pytest.importorskip("torch")
 
 import full_geometry  # noqa: E402
+from benchmarks.mitsuba_media import medium, with_media  # noqa: E402
 from full_geometry.geometry.points import ObjectModel, SurfacePoint, refract_in  # noqa: E402
 from full_geometry.geometry.sensors import camera_rays  # noqa: E402
 from full_geometry.integrators.walk_paths import FirstExits  # noqa: E402
@@ -26,7 +27,6 @@ from full_geometry.learning.model_errors import EVEN_SKY, errors_of  # noqa: E40
 from full_geometry.learning.network_fitting import Recipe  # noqa: E402
 from full_geometry.learning.training import Trained, train  # noqa: E402
 from full_geometry.objects.objects import object_of  # noqa: E402
-from full_geometry.scenes.mitsuba_scene import medium, with_media  # noqa: E402
 from full_geometry.trade import assess  # noqa: E402
 from full_geometry.transport import prepare  # noqa: E402
 from full_geometry.transport.exit_pairs import trace_exits  # noqa: E402

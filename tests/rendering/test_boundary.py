@@ -11,8 +11,8 @@ from rendered import independent
 mi = pytest.importorskip("mitsuba")
 import drjit as dr  # noqa: E402
 
+from benchmarks.mitsuba_media import with_media  # noqa: E402
 from full_geometry.objects.objects import object_of  # noqa: E402
-from full_geometry.scenes.mitsuba_scene import with_media  # noqa: E402
 from full_geometry.surface.translucent import is_smooth_boundary, smooth_boundary  # noqa: E402
 from full_geometry.trade.techniques import techniques  # noqa: E402
 

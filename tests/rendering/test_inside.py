@@ -14,7 +14,7 @@ from rendered import independent
 
 mi = pytest.importorskip("mitsuba")
 
-from full_geometry.scenes.mitsuba_scene import medium, with_media  # noqa: E402
+from benchmarks.mitsuba_media import medium, with_media  # noqa: E402
 from halfspace_sss.physics.fresnel import F_r  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")

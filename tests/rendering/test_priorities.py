@@ -12,7 +12,7 @@ import pytest
 from test_inside import SKY, _agree, _ball, _means
 from test_touching import _box
 
-from full_geometry.scenes.mitsuba_scene import VOLUME_PATH, medium
+from benchmarks.mitsuba_media import VOLUME_PATH, medium
 from full_geometry.walk import priorities
 
 pytestmark = pytest.mark.usefixtures("rgb")

@@ -11,7 +11,7 @@ import pytest
 from rendered import independent
 
 mi = pytest.importorskip("mitsuba")
-from full_geometry.scenes.mitsuba_scene import with_media  # noqa: E402
+from benchmarks.mitsuba_media import with_media  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rendered import independent
 
-from full_geometry.scenes.mitsuba_scene import with_media
+from benchmarks.mitsuba_media import with_media
 from halfspace_sss import Medium
 from halfspace_sss.physics.fresnel import F_r
 from halfspace_sss.tracing.tracer import trace

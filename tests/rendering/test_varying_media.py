@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from test_translucent_walk import _cube, _lamp, _runs, _scene, _small_lamp, _z
 
-from full_geometry.scenes.mitsuba_scene import with_media
+from benchmarks.mitsuba_media import with_media
 from halfspace_sss import Medium
 
 pytestmark = pytest.mark.usefixtures("rgb")
