@@ -9,7 +9,7 @@ import numpy as np
 
 from figures.computing.learnt import accepting, weight_files
 from figures.parts.part import Params, Part, Result, Task
-from halfspace_sss.comparison.curve_set import Curve, CurveSet
+from halfspace_sss.comparison.curve_set import Curve, CurveSet, render
 from halfspace_sss.comparison.reflectance_curves import FIG10_THETA_I, curves
 from halfspace_sss.materials import load
 from halfspace_sss.physics.medium import Medium
@@ -51,8 +51,6 @@ def model_curves(task: Task) -> dict[str, object]:
 
 def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
     """The figure as PDF and PNG, the values and the errors as tables."""
-    from halfspace_sss.comparison.curve_plot import render
-
     result = curve_set(results)
     files: dict[str, bytes | str] = {f"fig10.{ending}": data for ending, data in render(result).items()}
     return files | result.tables("fig10")

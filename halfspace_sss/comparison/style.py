@@ -5,11 +5,10 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-import matplotlib as mpl
-from matplotlib.backends.backend_pdf import FigureCanvasPdf
-from matplotlib.figure import Figure
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 COLUMN, TEXT = 3.35, 7.0  # widths of a column and of the text block, inches
 TRACED = "path_traced"
@@ -53,6 +52,8 @@ def look(series: str) -> Look:
 @contextmanager
 def paper() -> Iterator[None]:
     """Settings of a figure in a paper: 8 pt Times-like type, thin axes, TrueType fonts embedded in the PDF."""
+    import matplotlib as mpl
+
     settings = {
         "font.family": "STIXGeneral",
         "mathtext.fontset": "stix",
@@ -82,6 +83,8 @@ def paper() -> Iterator[None]:
 
 def saved(figure: Figure, dpi: int = 300) -> dict[str, bytes]:
     """The figure as vector PDF with embedded fonts and as PNG, by file ending; the same figure gives the same bytes."""
+    from matplotlib.backends.backend_pdf import FigureCanvasPdf
+
     FigureCanvasPdf(figure)
     files = {}
     for ending, metadata in (("pdf", {"CreationDate": None}), ("png", {})):

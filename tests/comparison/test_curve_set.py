@@ -125,7 +125,7 @@ def test_a_failure_while_drawing_loses_no_result(
     def fail(_: CurveSet) -> dict[str, bytes]:
         raise error
 
-    monkeypatch.setattr("halfspace_sss.comparison.curve_plot.render", fail)
+    monkeypatch.setattr("halfspace_sss.comparison.curve_set.render", fail)
     if isinstance(error, KeyboardInterrupt):
         with pytest.raises(KeyboardInterrupt):
             small.save(tmp_path / "new")
