@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 
 from full_geometry.geometry.instances import shapes_of
-from full_geometry.geometry.points import lane_numbers, lifted, opaque, sided
+from full_geometry.geometry.points import SurfacePoint, evaluate, lane_numbers, opaque, sided
 from full_geometry.geometry.rounding import ray_from
 from full_geometry.geometry.sensors import past_emitters, shows_sky
 from full_geometry.integrators.gathering import OutgoingLight
@@ -37,6 +37,7 @@ from full_geometry.walk.random_walk import (
     Visitor,
     Walk,
     Walker,
+    WalkExits,
     behind_of,
     draw,
     draw_channel,
@@ -88,22 +89,13 @@ class LightRecord:
 
 
 class Seen(NamedTuple):
-    """Emission that is found without chance along one way from a boundary.
-    `light`: of that way, with the throughput. `found`: whether it is found. `kept`: probability that a path does not
-    take that way; 1 where it may meet surfaces there."""
+    """Emission that is found without chance along one way from a boundary: mirrored, or behind an object.
+    `light`: of that way, with the throughput. `found`: whether it is found; behind an object the number of boundaries
+    on the way of a path without events, behind which it is. `kept`: probability that a path does not take that way, or
+    that a first flight does not leave; 1 where it may meet surfaces there."""
 
     light: mi.Spectrum
-    found: mi.Bool
-    kept: mi.Spectrum
-
-
-class SeenThrough(NamedTuple):
-    """Emission that is found without chance behind an object, on the way of a path without events.
-    `light`: with the throughput. `exits`: boundaries on that way, behind which it is found. `kept`: probability that a
-    first flight does not leave; 1 where it may meet surfaces there."""
-
-    light: mi.Spectrum
-    exits: mi.UInt32
+    found: mi.Bool | mi.UInt32
     kept: mi.Spectrum
 
 
@@ -499,12 +491,12 @@ class LightVisitor:
 
     def seen_emitters(
         self, walk: Walk, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32, active: mi.Bool
-    ) -> tuple[Seen, SeenThrough]:
+    ) -> tuple[Seen, Seen]:
         """What object k mirrors, and what is seen through it; added whatever is chosen, it must not count again.
         Only where light inside or leaving is known: beside light that is met by chance, of an even sky above all, the
         choice between both sides of the boundary has less noise. `active`: whether emitters are looked for; where a
         path has scattered, cones of delta lights are met instead."""
-        unseen = SeenThrough(mi.Spectrum(0), mi.UInt32(0), mi.Spectrum(1))
+        unseen = Seen(mi.Spectrum(0), mi.UInt32(0), mi.Spectrum(1))
         if self.unscattered is None and self.outgoing is None:
             return Seen(mi.Spectrum(0), mi.Bool(False), mi.Spectrum(1)), unseen
         smooth = ~self.media.row("rough", k)
@@ -524,7 +516,7 @@ class LightVisitor:
         F = mi.Spectrum(self.media.reflected(k, si)) if self.media.tinted else value
         return Seen(walk.weight * value * L_e, active, dr.select(nothing, 1 - F, 1))
 
-    def emitter_behind(self, walk: Walk, si: mi.SurfaceInteraction3f, k: mi.Int32, active: mi.Bool) -> SeenThrough:
+    def emitter_behind(self, walk: Walk, si: mi.SurfaceInteraction3f, k: mi.Int32, active: mi.Bool) -> Seen:
         """What is seen through object k without an event inside, which no free flight then meets.
         The light is (1 - F) Σ_j T_j F_1 ... F_{j-1} (1 - F_j) L_e, F of the boundary, F_j of the j-th on the way inside
         and T_j the transmittance up to it; of first flights 1 - T_1 (1 - F_1) are kept."""
@@ -541,14 +533,14 @@ class LightVisitor:
 
         # ---- what is seen at those after reflections inside, as far as there is light
         if not self.follows:
-            return SeenThrough(way.light, way.exits, dr.select(nothing, 1 - passed, 1))
+            return Seen(way.light, way.exits, dr.select(nothing, 1 - passed, 1))
         least = opaque(LEAST_REFLECTED) * dr.max(walk.weight * value)
 
         def on(way: WayThrough) -> mi.Bool:
             return way.going & (way.exits <= REFLECTIONS) & (dr.max(way.throughput) > least)
 
         way = dr.while_loop((way,), on, lambda way: (self._seen_at_boundary(way, k, walk.rng)[0],), label="behind")[0]
-        return SeenThrough(way.light, way.exits, dr.select(nothing, 1 - passed, 1))
+        return Seen(way.light, way.exits, dr.select(nothing, 1 - passed, 1))
 
     def _seen_at_boundary(self, way: WayThrough, k: mi.Int32, rng: mi.PCG32) -> tuple[WayThrough, mi.Spectrum, mi.Bool]:
         """The way through object k behind the next boundary, T (1 - F') there, and whether nothing is met beyond."""
@@ -739,7 +731,7 @@ class PathTracer:
         media, visitor = self.visitor.media, replace(self.visitor, brightest=self.brightest)
         scorer = ScoreVisitor(self.visitor, media, scores) if scores else None
         ahead = self.visitor.flight if self.visitor.ahead and not self.visitor.deep else None
-        walker = Walker(media, scorer or (FirstExitVisitor(visitor, exits) if exits else visitor), ahead=ahead)
+        walker = Walker(media, scorer or (FirstExitVisitor(visitor, exits.exits) if exits else visitor), ahead=ahead)
         total, step = (dr.opaque(mi.UInt32, v) for v in (n, lanes))  # kernels then serve images of any size
 
         # ---- the parts of an iteration
@@ -912,9 +904,9 @@ class PathTracer:
             again = light.sighted & enters & same & self.visitor.straight_light.passes_again(near)
         light = replace(light, L=L, previous=dr.select(again, light.previous, si.p), sighted=again,
                         pdf=dr.select(again, light.pdf, bs.pdf), delta=delta & ~again, scattered=scattered,
-                        precomputed=dr.select(enters, seen.exits > 0, mirrored.found),
+                        precomputed=dr.select(enters, seen.found > 0, mirrored.found),
                         run=light.run and light.run.ended(), shallow=held & enters if self.visitor.splits else (),
-                        exits=dr.select(enters, seen.exits, 0) if self.visitor.follows else ())  # fmt: skip
+                        exits=dr.select(enters, seen.found, 0) if self.visitor.follows else ())  # fmt: skip
         if behind is not None:
             L = L + self.visitor.spread_inner_lights(walk, scattered & enters)
             light = replace(light, delta=~again & (delta | enters | through | behind.unlit), L=L)
@@ -948,7 +940,7 @@ class PathTracer:
 
     def _seen(
         self, L: mi.Spectrum, p: CameraPath, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32, active: mi.Bool
-    ) -> tuple[Seen, SeenThrough, mi.Spectrum, CameraPath]:
+    ) -> tuple[Seen, Seen, mi.Spectrum, CameraPath]:
         """What object k mirrors, and what is seen through it, and the light with both, at first told apart."""
         # emission that rays find lacks delta lights: where a path has scattered, it meets their cones instead
         small = self.visitor.small
@@ -1035,46 +1027,34 @@ def _begin(
 #     ∫∫ S(x_i, w_i; x_o, w_o) mu_i f(x_i, w_i) dw_i dA_i = E[T f(x_i, w_i)].
 
 
-@dataclass
-class FirstExits:
-    """One lane for each path; normals point outwards, directions away from the surface, which see shading normals."""
+class FirstExits(NamedTuple):
+    """One lane for each path.
+    `object`: the number of what it meets first, or -1. `start`: x_o and w_o there. `exits`: x_i, w_i and T."""
 
-    object: mi.Int32  # the number of the object that the path meets first, or -1
-    x_o: mi.Point3f
-    n_o: mi.Normal3f  # geometric
-    n_o_shading: mi.Normal3f
-    w_o: mi.Vector3f
-    throughput: mi.Spectrum  # T; 0 where no walk left
-    x_i: mi.Point3f
-    n_i: mi.Normal3f  # geometric
-    n_i_shading: mi.Normal3f
-    w_i: mi.Vector3f
-    order: mi.UInt32  # scattering events
-    face: mi.UInt32  # at x_i
+    object: mi.Int32
+    start: SurfacePoint
+    exits: WalkExits
 
     @classmethod
     def of(cls, scene: mi.Scene, media: WalkMedia, rays: mi.Ray3f) -> FirstExits:
         """What rays of the camera meet first, and room for where their walks leave."""
-        # x_o and w_o; what walks leave by is stored as they do
         si = media.instance_scene.intersect(scene, rays, mi.RayFlags.All, coherent=True)
         k = media.index_of(si, si.is_valid())
         si = media.seen(si, k, rays.d)
-        n = dr.width(rays)
-        kinds = mi.Spectrum, mi.Point3f, mi.Normal3f, mi.Normal3f, mi.Vector3f, mi.UInt32, mi.UInt32
-        result = cls(k, mi.Point3f(si.p), mi.Normal3f(si.n), mi.Normal3f(si.sh_frame.n), mi.Vector3f(-rays.d),
-                    *(dr.zeros(kind, n) for kind in kinds))  # fmt: skip
-        dr.eval(result)
+        start = SurfacePoint(mi.Point3f(si.p), mi.Normal3f(si.n), mi.Normal3f(si.sh_frame.n), mi.Vector3f(-rays.d))
+        result = cls(k, start, WalkExits.none(dr.width(rays)))
+        evaluate(result)
         return result
 
     def of_object(self, k: int) -> FirstExits:
         """The lanes of paths that meet object k first."""
         result = self.gather(dr.compress(self.object == k))
-        dr.eval(result)
+        evaluate(result)
         return result
 
     def gather(self, lanes: mi.UInt32) -> FirstExits:
         """The paths of the given lanes."""
-        return dr.gather(FirstExits, self, lanes)
+        return FirstExits(dr.gather(mi.Int32, self.object, lanes), self.start.gather(lanes), self.exits.gather(lanes))
 
 
 @dataclass
@@ -1092,7 +1072,7 @@ class FirstExitVisitor:
     `visitor`: the other one. `exits`: where they are stored."""
 
     visitor: Visitor
-    exits: FirstExits
+    exits: WalkExits
 
     def event(self, walk: Walk, record: FirstExitRecord, event: Event) -> tuple[Walk, FirstExitRecord]:
         walk, kept = self.visitor.event(walk, record.record, event)
@@ -1112,11 +1092,6 @@ class FirstExitVisitor:
 
     def crossing(self, walk: Walk, record: FirstExitRecord, crossing: Crossing) -> tuple[Walk, FirstExitRecord]:
         walk, kept = self.visitor.crossing(walk, record.record, crossing)
-        # x_i, w_i and T of a walk that leaves the object which its path has met first
-        to, si = self.exits, crossing.si
-        leaves, n_shading = walk.alive & crossing.leaves & record.first, lifted(si.sh_frame.n, si.n, walk.d)
-        pairs = ((to.throughput, walk.weight), (to.x_i, si.p), (to.n_i, si.n), (to.n_i_shading, n_shading),
-                 (to.w_i, walk.d), (to.order, walk.order), (to.face, si.prim_index))  # fmt: skip
-        for target, value in pairs:
-            dr.scatter(target, type(target)(value), record.index, leaves)
+        # of a walk that leaves the object which its path has met first
+        self.exits.put(record.index, walk, crossing, walk.alive & crossing.leaves & record.first)
         return walk, replace(record, record=kept)

@@ -18,7 +18,6 @@ import numpy as np
 
 from full_geometry.geometry import mesh
 from full_geometry.geometry.points import SurfacePoint, evaluate
-from full_geometry.integrators.walk_paths import FirstExits
 from full_geometry.learning.model_errors import (
     ExitRadiance,
     ExitTruth,
@@ -158,17 +157,11 @@ class CameraExits:
         for part, a, b in zip(with_exits, ends, ends[1:]):
             own = chosen[(chosen >= a) & (chosen < b)] - a
             if len(own):
-                starts, ends = _points(part.gather(aligned(mi.UInt32, own)))
+                _, starts, ends = part.gather(aligned(mi.UInt32, own))
+                ends = ends._replace(T=dr.select(ends.order >= 1, ends.T, 0))  # of the orders from one on
                 parts.append((self.source.object.knowing(starts), ends))
         evaluate(parts)
         return parts
-
-
-def _points(part: FirstExits) -> tuple[SurfacePoint, WalkExits]:
-    """First exits of the camera as walks of this package, of the orders from one on."""
-    starts = SurfacePoint(part.x_o, part.n_o, part.n_o_shading, part.w_o)
-    ends = SurfacePoint(part.x_i, part.n_i, part.n_i_shading, part.w_i)
-    return starts, WalkExits(ends, dr.select(part.order >= 1, part.throughput, 0), part.order, part.face)
 
 
 VALIDATIONS = 4  # in a run

@@ -533,6 +533,23 @@ class WalkExits(NamedTuple):
     order: mi.UInt32
     face: mi.UInt32
 
+    @classmethod
+    def none(cls, n: int) -> WalkExits:
+        """Room for those of n walks."""
+        at = SurfacePoint(*(dr.zeros(kind, n) for kind in (mi.Point3f, mi.Normal3f, mi.Normal3f, mi.Vector3f)))
+        return cls(at, dr.zeros(mi.Spectrum, n), dr.zeros(mi.UInt32, n), dr.zeros(mi.UInt32, n))
+
+    def gather(self, walks: mi.UInt32) -> WalkExits:
+        return WalkExits(self.at.gather(walks), *(dr.gather(type(v), v, walks) for v in self[1:]))
+
+    def put(self, index: mi.UInt32, walk: Walk, crossing: Crossing, kept: mi.Bool) -> None:
+        """Store x_i and w_i of a walk that leaves, with its throughput, at its number."""
+        si = crossing.si
+        at = surface_point(si.p, si.n, si.sh_frame.n, walk.d)
+        targets, values = (*self.at[:4], *self[1:]), (*at[:4], walk.weight, walk.order, si.prim_index)
+        for target, value in zip(targets, values):
+            dr.scatter(target, type(target)(value), index, kept)
+
     @property
     def left(self) -> mi.Bool:
         """Whether the walk left at an order that is kept."""
@@ -551,19 +568,14 @@ class ExitVisitor(StartVisitor):
     @classmethod
     def of(cls, n: int, fewest: int = 0, most: int = MOST) -> ExitVisitor:
         """For n walks."""
-        at = SurfacePoint(*(dr.zeros(kind, n) for kind in (mi.Point3f, mi.Normal3f, mi.Normal3f, mi.Vector3f)))
-        exits = WalkExits(at, dr.zeros(mi.Spectrum, n), dr.zeros(mi.UInt32, n), dr.zeros(mi.UInt32, n))
+        exits = WalkExits.none(n)
         evaluate(exits)
         return cls(exits, *(dr.opaque(mi.UInt32, order) for order in (fewest, most)))
 
     def crossing(self, walk: Walk, record: mi.UInt32, crossing: Crossing) -> tuple[Walk, mi.UInt32]:
-        # x_i and w_i of a walk that leaves, with its throughput; the walk ends
-        leaves, si = walk.alive & crossing.leaves, crossing.si
-        at = surface_point(si.p, si.n, si.sh_frame.n, walk.d)
+        leaves = walk.alive & crossing.leaves
         kept = leaves & (walk.order >= self.fewest) & (walk.order <= self.most)
-        targets, values = (*self.exits.at[:4], *self.exits[1:]), (*at[:4], walk.weight, walk.order, si.prim_index)
-        for target, value in zip(targets, values):
-            dr.scatter(target, type(target)(value), record, kept)
+        self.exits.put(record, walk, crossing, kept)
         return replace(walk, alive=walk.alive & ~leaves), record
 
 

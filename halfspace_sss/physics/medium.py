@@ -10,7 +10,6 @@ import math
 import numbers
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -414,20 +413,13 @@ def check_scalar_medium(medium: object) -> None:
     check_numbers("medium", medium)
 
 
-@runtime_checkable
-class HasMedium(Protocol):
-    """A material."""
-
-    medium: Medium
-
-
-def medium_of(given: Medium | HasMedium) -> Medium:
+def medium_of(given: object) -> Medium:
     """The medium of a material; anything else as it is, but for names, which `materials.load` takes.
     ValueError if it is a name."""
     if isinstance(given, str):
         hint = f"`halfspace_sss.materials.load({given!r})` has the material of a name"
         raise ValueError(f"medium must be a Medium or a Material, got {given!r}; {hint}")
-    return given.medium if isinstance(given, HasMedium) else given
+    return getattr(given, "medium", given)
 
 
 def eval_hg(cos_theta: Real, g: Real) -> Real:

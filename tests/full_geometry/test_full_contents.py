@@ -87,8 +87,7 @@ def scene(
 def seen(loaded: mi.Scene, spp: int) -> SurfacePoint:
     """Where rays of the camera meet the object, which fills the picture."""
     rays = camera_rays(loaded.sensors()[0], spp, (3, 4))[0]
-    found = FirstExits.of(loaded, WalkMedia.of(loaded, UNIT), rays)
-    return SurfacePoint(found.x_o, found.n_o, found.n_o_shading, found.w_o)
+    return FirstExits.of(loaded, WalkMedia.of(loaded, UNIT), rays).start
 
 
 def images(loaded: mi.Scene, spp: int, runs: int = RUNS) -> np.ndarray:

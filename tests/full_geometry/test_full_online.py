@@ -22,7 +22,6 @@ import drjit as dr  # noqa: E402
 
 import full_geometry  # noqa: E402
 from figures import app as cli  # noqa: E402
-from full_geometry.geometry.points import SurfacePoint  # noqa: E402
 from full_geometry.learning import training  # noqa: E402
 from full_geometry.learning.network_fitting import Recipe  # noqa: E402
 from full_geometry.learning.online import combined  # noqa: E402
@@ -239,12 +238,11 @@ def test_first_exits_of_paths_from_the_camera_are_those_of_walks_from_where_they
     settings = scene.integrator().settings
     walks = camera_walks.CameraWalks(scene, settings, 0, 3, tmp_path / "walks.exr", {})
     (found,) = walks.exits(scene.shapes()[0], 0, 256)
-    starts = SurfacePoint(found.x_o, found.n_o, found.n_o_shading, found.w_o)
-    other = trace_exits(object_of(scene, None), starts, (5,))
-    T, T_other = np.array(dr.select(found.order >= 2, found.throughput, 0)), np.array(other.T)
+    own, other = found.exits, trace_exits(object_of(scene, None), found.start, (5,))
+    T, T_other = np.array(dr.select(own.order >= 2, own.T, 0)), np.array(other.T)
     assert T.shape[1] > 5000 and abs(walks.hits(scene.shapes()[0]) - T.shape[1] / 256) < 12
     for f in (lambda x, w: 1.0, lambda x, w: x[2] ** 2, lambda x, w: np.maximum(w[1], 0), lambda x, w: w[2] ** 4):
-        a = T * f(np.array(found.x_i), np.array(found.w_i))
+        a = T * f(np.array(own.at.p), np.array(own.at.w))
         b = T_other * f(np.array(other.at.p), np.array(other.at.w))
         error = np.sqrt((a.var(axis=1) + b.var(axis=1)) / a.shape[1])
         assert np.all(np.abs(a.mean(axis=1) - b.mean(axis=1)) < 4 * error)
