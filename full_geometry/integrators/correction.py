@@ -166,7 +166,6 @@ class Corrections:
         self.seconds = 0.0
 
     def walk(self, settings: Settings) -> mi.Integrator:
-        """The integrator of the walks."""
         if self._walk is None:
             self._walk = mi.load_dict({"type": "translucent_walk", **settings.shared(), "layers": settings.layers})
             self._walk.ends = True

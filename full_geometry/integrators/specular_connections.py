@@ -46,7 +46,6 @@ class Connection:
 
 
 def no_connection() -> Connection:
-    """A connection that is not valid."""
     return Connection(
         p=mi.Point3f(0), n=mi.Normal3f(0, 0, 1), d=mi.Vector3f(0, 0, 1), w=mi.Vector3f(0, 0, 1), T=mi.Float(0),
         length=mi.Float(0), density=mi.Float(0), valid=mi.Bool(False),

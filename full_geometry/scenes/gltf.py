@@ -422,7 +422,6 @@ def _translucent(given: dict[str, Any], medium: Medium | None, base: dict[str, A
 
 
 def _is_textured(material: pygltflib.Material) -> bool:
-    """Whether a material has a texture."""
     pbr = material.pbrMetallicRoughness
     parts = [vars(material), vars(pbr) if pbr else {}, *(material.extensions or {}).values()]
     return any(name.endswith("Texture") and value is not None for part in parts for name, value in part.items())

@@ -187,7 +187,6 @@ class Assessment:
 
     @classmethod
     def from_record(cls, record: dict[str, Any]) -> Assessment:
-        """The assessment of a `record`."""
         objects = []
         for o in record["objects"]:
             rows = tuple(TechniqueTrade(**{key: _known(key, value) for key, value in w.items()}) for w in o["ways"])

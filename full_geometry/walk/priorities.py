@@ -117,7 +117,6 @@ class Priorities:
         return cls(holders, tables, made)
 
     def members(self) -> np.ndarray:
-        """The numbers of all members."""
         return np.flatnonzero(np.array(self.tables["bit"]))
 
     def start(self, k: mi.Int32) -> mi.UInt32:

@@ -254,8 +254,6 @@ class Bar:
 
 
 class _Moving:
-    """A bar that moves."""
-
     def __init__(self, title: str, screen: Console, done: int) -> None:
         from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
         from rich.table import Column

@@ -128,7 +128,6 @@ class ModelError(NamedTuple):
 
     @property
     def known(self) -> NoiseFree:
-        """The error with all that is known of it."""
         return NoiseFree(self.square, self.square_error)
 
 

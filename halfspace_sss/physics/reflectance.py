@@ -108,12 +108,11 @@ def _sources(m: _Modes, basis: _Basis, inside: float) -> tuple[np.ndarray, np.nd
 
 
 class SlabFluxes(NamedTuple):
-    """Fractions of incident flux of a slab between slides; all but the last for light along the normal."""
+    """Fractions of incident flux of a slab between slides, for light along the normal."""
 
     reflectance: float
     transmittance: float
     unscattered: float  # part of the transmittance
-    diffuse_reflectance: float
 
 
 LARGEST_SLAB_ALBEDO = 1 - 1e-9  # beyond it light that decays from both sides cannot be told apart
@@ -144,7 +143,6 @@ def slab_fluxes(
     entering = (1 - F) * eta**2
     both, odd = np.linalg.solve(lit + dark, entering), np.linalg.solve(lit - dark, entering)
     a, b = (both + odd) / 2, (both - odd) / 2
-    diffuse = 2 * np.sum(basis.w * basis.mu * (1 - F) * (up @ a + down @ (far * b) - eta**2)) + 1
     # along the normal: what modes scatter on the way through, I⁻(0) = E F I⁺(tau) + SU, I⁺(tau) = E (F I⁻(0) + T) + SD
     u, v = _sources(m, basis, 1.0)
     E, near = math.exp(-thick), -np.expm1(-(m.k + 1) * thick) / (m.k + 1)
@@ -158,7 +156,7 @@ def slab_fluxes(
     straight = math.exp(-tau)
     return SlabFluxes(
         reflectance=F + (1 - F) * upwards / eta**2, transmittance=(1 - F) * downwards / eta**2,
-        unscattered=(1 - F) ** 2 * straight / (1 - (F * straight) ** 2), diffuse_reflectance=float(diffuse),
+        unscattered=(1 - F) ** 2 * straight / (1 - (F * straight) ** 2),
     )  # fmt: skip
 
 

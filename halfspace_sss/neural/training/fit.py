@@ -364,7 +364,6 @@ class _FitState:
         return self.done or self.schedule.share(self.spent) >= 1
 
     def advance(self, source: Source) -> None:
-        """One step."""
         rate = self.schedule.rate_at(self.spent)
         value = self.descent.step(self.learner.loss(source(self.generator)), rate)
         self.seconds, self.cpu_seconds = time.monotonic() - self.started, time.process_time() - self.cpu_started

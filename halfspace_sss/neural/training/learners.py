@@ -63,7 +63,6 @@ def _ray(mu: torch.Tensor, azimuth: torch.Tensor) -> tuple[torch.Tensor, ...]:
 
 
 def torch_library() -> Library:
-    """The array library of torch."""
     return library(torch.empty(0))
 
 
