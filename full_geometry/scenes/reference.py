@@ -57,7 +57,7 @@ from full_geometry.scenes.reference_store import (
 from full_geometry.scenes.scene_files import first_cause
 from full_geometry.settings import AUTO, check_variant
 from full_geometry.surface.wrapped import surface_of
-from halfspace_sss.checks import check_count
+from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.provenance import check_folder, one_writer, provenance
 
 COARSE = 3.0  # pixels, standard deviation of the filter
@@ -286,10 +286,10 @@ class Limits:
         for name in ("spp", "passes", "spp_per_pass"):
             if getattr(self, name) is not None:
                 check_count(name, getattr(self, name), 1)
-        for name in ("target_error", "seconds"):
-            value = getattr(self, name)
-            if value is not None and not (math.isfinite(value) and value > 0):
-                raise ValueError(f"{name} must be finite and > 0, got {value!r}")
+        if self.target_error is not None:
+            check_interval("target_error", self.target_error, 1e-6, 1.0)  # 4 is meant as 4 %
+        if self.seconds is not None and not (math.isfinite(self.seconds) and self.seconds > 0):
+            raise ValueError(f"seconds must be finite and > 0, got {self.seconds!r}")
         if not self.interval >= 0:
             raise ValueError(f"interval must be >= 0, got {self.interval!r}")
 
