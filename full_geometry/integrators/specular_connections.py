@@ -25,6 +25,7 @@ from full_geometry.objects.objects import TranslucentObject
 FIRST, OTHERS = (6, 0.5), (10, 0.15)
 TOLERANCE = 2e-4  # distance by which the target may be missed, over its distance
 EXACT = 1e-5  # of that, below which Newton's method ends
+LEAST_SPREAD = 1e-12  # area across rays at the target per solid angle inside, over the square of its distance
 SPREAD = (20.0, 2.0)  # concentrations of directions about the first guess
 MIRRORED = 0.5  # probability to start as a flat boundary would reflect
 
@@ -107,13 +108,14 @@ def connect(
     `p`, `target`: the ends. `reflects`: where the ray is reflected; where it is False itself, code for that is left
     out. `newton`: the number of steps, and the longest, radians."""
     steps, longest = newton
+    least = LEAST_SPREAD * dr.squared_norm(target - p)
 
     def step(k: mi.UInt32, d: mi.Vector3f, best: Connection, active: mi.Bool) -> tuple:
         # ---- J delta = e: the step delta in two axes across d, J the derivative of the miss e by d
         e, J, met, valid = _miss(obj, (p, target), d, reflects, active)
         (a, b), (c, f) = J
         det = a * f - b * c
-        inverse = dr.rcp(dr.select(dr.abs(det) > 1e-12, det, 1e-12))
+        inverse = dr.rcp(dr.select(dr.abs(det) > least, det, least))
         step_1, step_2 = (f * e[0] - b * e[1]) * inverse, (a * e[1] - c * e[0]) * inverse
         size = dr.sqrt(step_1 * step_1 + step_2 * step_2)
         shrink = dr.minimum(1, longest / dr.maximum(size, 1e-9))
@@ -122,7 +124,7 @@ def connect(
         miss = dr.sqrt(e[0] * e[0] + e[1] * e[1])
         close = valid & (miss < TOLERANCE * dr.norm(target - mi.Point3f(met[0])))
         at, n, w, T, length = met
-        density = 1 / dr.maximum(dr.abs(det), 1e-12)
+        density = 1 / dr.maximum(dr.abs(det), least)
         new = Connection(p=at, n=n, d=d, w=w, T=T, length=length, density=density, valid=close)
         best = dr.select(active & close, new, best)
 

@@ -280,7 +280,7 @@ def _on_ray(walk: Walk, event: Event, u: mi.Float) -> tuple[mi.Float, mi.Float]:
     # equiangular: theta uniform between the start of the ray and its end, t = t_0 + D tan(theta)
     v = event.p - walk.o
     t_0 = dr.dot(v, walk.d)
-    D = dr.maximum(dr.norm(v - walk.d * t_0), 1e-9)
+    D = dr.maximum(dr.norm(v - walk.d * t_0), 1e-9 * dr.norm(v) + 1e-30)
     start = dr.atan2(-t_0, D)
     width = 0.5 * dr.pi - start
     t = dr.maximum(t_0 + D * dr.tan(start + u * width), 0)

@@ -21,13 +21,19 @@ from halfspace_sss.physics.fresnel import F_t, mu_external  # noqa: E402
 ETA, RADIUS, N = 1.4, 2.0, 400
 
 
+def ball_of(unit: float):
+    """A ball in units of so many mm."""
+    shape = {"type": "sphere", "radius": RADIUS / unit, "bsdf": surface()}
+    integrator = {"type": "bssrdf", "mm_per_unit": unit}
+    scene = mi.load_dict({"type": "scene", "integrator": integrator, "sky": {"type": "constant"}, "s": shape})
+    return scene.integrator().prepare(scene)[0]
+
+
 @pytest.fixture
 def ball():
     mi.set_variant("llvm_ad_rgb")
     full_geometry.register()
-    shape = {"type": "sphere", "radius": RADIUS, "bsdf": surface()}
-    scene = mi.load_dict({"type": "scene", "integrator": {"type": "bssrdf"}, "sky": {"type": "constant"}, "s": shape})
-    return scene.integrator().prepare(scene)[0]
+    return ball_of(1.0)
 
 
 def directions(seed: int) -> np.ndarray:
@@ -111,6 +117,18 @@ def test_the_density_of_a_connection_is_how_its_target_spreads(ball) -> None:
     assert chosen.sum() > 50
     ratio = density[chosen] * area[chosen]
     assert np.median(np.abs(ratio - 1)) < 5e-3 and np.quantile(np.abs(ratio - 1), 0.9) < 0.05
+
+
+def test_connections_are_the_same_in_any_unit_of_length(ball) -> None:
+    p, target, unit = points(3, 0.7), directions(4) * 8, 1e7
+    found = []
+    for obj, u in ((ball, 1.0), (ball_of(unit), unit)):
+        met = refracted_connection(obj, mi.Point3f(p / u), mi.Point3f(target / u), mi.Bool(True))
+        found.append((np.array(met.valid), np.array(met.density) / u**2))
+    valid = found[0][0] & found[1][0]
+    assert valid.sum() > N // 4 and (found[0][0] != found[1][0]).mean() < 0.01  # by rounding
+    ratio = found[1][1][valid] / found[0][1][valid]
+    assert np.quantile(np.abs(ratio - 1), 0.9) < 1e-3
 
 
 def test_a_connection_by_one_reflection_leaves_towards_its_target_and_knows_how_that_spreads(ball) -> None:

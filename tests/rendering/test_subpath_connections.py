@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ mi = pytest.importorskip("mitsuba")
 import drjit as dr  # noqa: E402
 
 from full_geometry.objects.small_emitters import SmallEmitters  # noqa: E402
+from full_geometry.walk import emitter_connections  # noqa: E402
 from full_geometry.walk.emitter_connections import STEEPEST, SubpathConnections, find_connections  # noqa: E402
 from full_geometry.walk.media import WalkMedia  # noqa: E402
 from full_geometry.walk.random_walk import Event  # noqa: E402
@@ -215,3 +217,16 @@ def test_connections_cover_the_rays_that_come_steeply_from_an_emitter_that_looks
 def test_scenes_without_small_emitters_or_smooth_objects_have_no_connections() -> None:
     assert connections_of({"sky": {"type": "constant"}}) is None
     assert connections_of({"sun": sun(0.0, 0.0)}, share=0.0) is None
+
+
+@pytest.mark.parametrize("unit", [1e-7, 1e7])
+def test_events_on_a_ray_are_drawn_the_same_in_any_unit_of_length(unit: float) -> None:
+    """Also where the ray passes the event by a thousandth of the way to it."""
+    d, across = (mi.Vector3f(*v) for v in ([0.6, 0, 0.8], [0, 1, 0]))
+    found = []
+    for u in (1.0, unit):
+        far, near = np.array([0.5, 3.0, 3.0]) * u, np.array([0.1, 1e-3, 3e-3]) * u
+        event = SimpleNamespace(p=mi.Point3f(d * mi.Float(far) + across * mi.Float(near)))
+        t, inverse = emitter_connections._on_ray(SimpleNamespace(o=mi.Point3f(0), d=d), event, mi.Float(0.5))
+        found.append((np.array(t) / u, np.array(inverse) * u))
+    np.testing.assert_allclose(*found, rtol=1e-3)
