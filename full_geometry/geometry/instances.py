@@ -191,6 +191,10 @@ class InstanceTransform(NamedTuple):
         """A normal in the frame of the group."""
         return dr.normalize(_transposed(self.to_world, n))
 
+    def vector_to_world(self, v: mi.Vector3f) -> mi.Vector3f:
+        """A vector along the surface in the scene."""
+        return mi.Vector3f(_map(self.to_world, v))
+
     def ray_to_object(self, ray: mi.Ray3f) -> mi.Ray3f:
         """A ray in the frame of the group, at the same distances."""
         local = mi.Ray3f(ray)

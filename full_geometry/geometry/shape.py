@@ -259,6 +259,15 @@ class Geometry:
         """-1 for a mesh with flip_normals, whose normals Mitsuba turns, but not their derivatives."""
         return -1.0 if self.shape.is_mesh() and mesh.is_flipped(self.shape) else 1.0
 
+    def tangents(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Vector3f, mi.Vector3f]:
+        """dp_du and dp_dv by the parameters that dn_du and dn_dv are by: of a mesh Mitsuba has those of normals by
+        barycentric coordinates, those of points by uv where it has any."""
+        if not (self.shape.is_mesh() and self.shape.has_vertex_texcoords()):
+            return si.dp_du, si.dp_dv
+        a, b, c = mesh.positions_at(self.shape, mesh.vertices_of(self.shape, si.prim_index, active), active)
+        edges = mi.Vector3f(b - a), mi.Vector3f(c - a)
+        return edges if self.transform is None else tuple(map(self.transform.vector_to_world, edges))
+
     def side(self, prim_index: mi.UInt32, active: mi.Bool = True) -> mi.Float:
         """1 where the geometric normal of a face points outwards, -1 where it points inwards."""
         if self.signs is None:

@@ -196,11 +196,12 @@ def _arrive(
     si, n_out, n = met = meet(obj, o + off, d, mi.RayFlags.All | mi.RayFlags.dNSdUV, active)
     t, found = dr.maximum(si.t + dr.dot(off, d), 0), []
     flip = dr.select(dr.dot(si.sh_frame.n, n_out) > 0, 1.0, -1.0) * obj.geometry.curvature_sign
+    tangents = obj.geometry.tangents(si, active & si.is_valid())
     for dx, dd in steps:
         # dx + t dd, moved along d into the tangent plane; dn = n_u du + n_v dv
         dx = dx + dd * t
         dx = dx - d * (dr.dot(dx, n) / dr.dot(d, n))
-        du, dv = _surface_steps(si, dx)
+        du, dv = _surface_steps(tangents, dx)
         found.append((dx, dd, (si.dn_du * du + si.dn_dv * dv) * flip))
     return t, met, found
 
@@ -215,11 +216,12 @@ def _refract(obj: TranslucentObject, d: mi.Vector3f, n: mi.Normal3f) -> tuple[mi
     return dr.normalize(w), F, (c > 0) & (c_t2 > 0)
 
 
-def _surface_steps(si: mi.SurfaceInteraction3f, dx: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
-    """(du, dv) with dp_du du + dp_dv dv = dx; 0 where the shape has no parametrisation."""
+def _surface_steps(tangents: tuple[mi.Vector3f, mi.Vector3f], dx: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+    """(du, dv) with dp_du du + dp_dv dv = dx; 0 where the shape has no parametrisation. `tangents`: dp_du, dp_dv."""
     # normal equations of the 3 x 2 matrix (dp_du, dp_dv)
-    a, b, c = dr.dot(si.dp_du, si.dp_du), dr.dot(si.dp_du, si.dp_dv), dr.dot(si.dp_dv, si.dp_dv)
-    p, q = dr.dot(si.dp_du, dx), dr.dot(si.dp_dv, dx)
+    dp_du, dp_dv = tangents
+    a, b, c = dr.dot(dp_du, dp_du), dr.dot(dp_du, dp_dv), dr.dot(dp_dv, dp_dv)
+    p, q = dr.dot(dp_du, dx), dr.dot(dp_dv, dx)
     det = a * c - b * b
     inverse = dr.select(det > 1e-14 * a * c, dr.rcp(det), 0)
     return (c * p - b * q) * inverse, (a * q - b * p) * inverse

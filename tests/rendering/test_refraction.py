@@ -21,9 +21,9 @@ from halfspace_sss.physics.fresnel import F_t, mu_external  # noqa: E402
 ETA, RADIUS, N = 1.4, 2.0, 400
 
 
-def ball_of(unit: float):
-    """A ball in units of so many mm."""
-    shape = {"type": "sphere", "radius": RADIUS / unit, "bsdf": surface()}
+def ball_of(unit: float, shape: dict | None = None):
+    """A ball, or another shape, in units of so many mm."""
+    shape = {**(shape or {"type": "sphere", "radius": RADIUS / unit}), "bsdf": surface()}
     integrator = {"type": "bssrdf", "mm_per_unit": unit}
     scene = mi.load_dict({"type": "scene", "integrator": integrator, "sky": {"type": "constant"}, "s": shape})
     return scene.integrator().prepare(scene)[0]
@@ -129,6 +129,32 @@ def test_connections_are_the_same_in_any_unit_of_length(ball) -> None:
     assert valid.sum() > N // 4 and (found[0][0] != found[1][0]).mean() < 0.01  # by rounding
     ratio = found[1][1][valid] / found[0][1][valid]
     assert np.quantile(np.abs(ratio - 1), 0.9) < 1e-3
+
+
+def octahedron(path, uv: bool) -> dict:
+    """One with normals as round as a ball's."""
+    corners, lines = RADIUS * np.concatenate([np.eye(3), -np.eye(3)]), []
+    for x, y, z in corners:
+        lines += [f"v {x} {y} {z}", f"vn {x / RADIUS} {y / RADIUS} {z / RADIUS}"]
+        lines += [f"vt {0.3 * x} {x + z - y}"] if uv else []
+    for flip in np.ndindex(2, 2, 2):
+        face = [k + 3 * f for k, f in enumerate(flip)][:: 1 if sum(flip) % 2 == 0 else -1]
+        lines.append("f " + " ".join(f"{c + 1}/{c + 1 if uv else ''}/{c + 1}" for c in face))
+    path.write_text("\n".join(lines))
+    return {"type": "obj", "filename": str(path)}
+
+
+def test_uv_of_a_mesh_change_no_connection(ball, tmp_path) -> None:
+    """Mitsuba has derivatives of points by uv, but those of normals by barycentric coordinates."""
+    p, target, found = 0.3 * points(3, 0.0), directions(4) * 8, []
+    for uv in (False, True):
+        obj = ball_of(1.0, octahedron(tmp_path / f"{uv}.obj", uv))
+        assert obj.geometry.shape.has_vertex_texcoords() == uv
+        met = refracted_connection(obj, mi.Point3f(p), mi.Point3f(target), mi.Bool(True))
+        found.append((np.array(met.valid), np.array(met.density)))
+    valid = found[0][0] & found[1][0]
+    assert valid.sum() > N // 4 and (found[0][0] == found[1][0]).all()
+    np.testing.assert_allclose(found[0][1][valid], found[1][1][valid], rtol=1e-3)
 
 
 def test_a_connection_by_one_reflection_leaves_towards_its_target_and_knows_how_that_spreads(ball) -> None:
