@@ -250,7 +250,8 @@ def _interaction(
         u, v, w = mesh.texcoords_at(obj.shape, vertices, active)
         e, f, d = b - a, c - a, si.p - a
         ee, ef, ff = dr.dot(e, e), dr.dot(e, f), dr.dot(f, f)
-        det = dr.maximum(ee * ff - ef * ef, 1e-30)
+        det = ee * ff - ef * ef
+        det = dr.select(det > 0, det, 1)  # a face without area has its first corner
         s = (ff * dr.dot(d, e) - ef * dr.dot(d, f)) / det
         t = (ee * dr.dot(d, f) - ef * dr.dot(d, e)) / det
         si.uv = u + (v - u) * s + (w - u) * t

@@ -10,7 +10,9 @@ import pytest
 from test_translucent_walk import WIDEST_Z_OF_RUNS, _lamp, _runs, _scene, _small_lamp, _z
 
 from full_geometry.geometry.points import SurfacePoint
+from full_geometry.geometry.shape import analyse_shape
 from full_geometry.settings import Settings
+from full_geometry.surface.textured import _interaction
 from full_geometry.transport.palette import Distances
 from full_geometry.transport.prepare import make_objects
 from halfspace_sss import Medium, bssrdf, measure
@@ -228,6 +230,15 @@ def test_the_albedo_of_aovs_is_that_of_the_texels() -> None:
         Medium.from_albedo(np.array(albedo), 1.0, PLAIN["g"], PLAIN["eta"]).reflectance(0.8) for albedo in albedos
     ]
     np.testing.assert_allclose(found, wanted, rtol=2e-3)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-8, 1e8])
+def test_points_of_a_mesh_have_their_uv_in_any_unit_of_length(unit: float) -> None:
+    cube = mi.load_dict({"type": "cube", "to_world": mi.ScalarTransform4f().scale(unit)})
+    ray = mi.Ray3f(mi.Point3f([0.2 * unit, -0.7 * unit], 0.1 * unit, 3 * unit), mi.Vector3f(0, 0, -1))
+    si = mi.load_dict({"type": "scene", "cube": cube}).ray_intersect(ray)
+    found = _interaction(analyse_shape(cube), si.p, si.n, si.prim_index, mi.Bool(True))
+    np.testing.assert_allclose(found.uv, si.uv, atol=1e-5)
 
 
 def test_texels_that_change_are_as_in_a_fresh_scene() -> None:
