@@ -67,8 +67,6 @@ MOST_PLACES = 64  # of objects and their instances
 ROOTS = (*R_4, GOLDEN)  # not the fifth power of the same root: directions would lie on a line, as 1/g⁴ + 1/g⁵ = 1
 LEAST_ALBEDO = 1e-6
 SAMPLES_OF_LIGHT, FEWEST_OF_LIGHT = 4, 2**20  # of the image that light inside is precomputed for: of a walk, of all
-# behind walls of glass, and where things overlap, light is traced: it needs the cells of all samples
-TRACED_SAMPLES_OF_LIGHT = SAMPLES_PER_WALK
 BRIGHTEST = 1 / 16384  # of the residuals of a launch, which are as bright as the next
 COSINES, OF_COSINE = 32, 4096  # of what a rough boundary lets in
 SEED = 500
@@ -241,8 +239,8 @@ class Corrections:
         missing = [k for k, g in enumerate(gathered) if g and self._launches(k) < launches]
         if missing or walk.outgoing is None:
             walk.outgoing = None
-            each = TRACED_SAMPLES_OF_LIGHT if alone else SAMPLES_OF_LIGHT
-            samples = max(each * number, FEWEST_OF_LIGHT)
+            # light that leaves into glass or what overlaps is traced, and needs the cells of all samples
+            samples = max((SAMPLES_PER_WALK if alone else SAMPLES_OF_LIGHT) * number, FEWEST_OF_LIGHT)
             tracer = walk.tracer(scene, SEED, ImageSamples(samples, FEWEST_POINTS))
             tracer = replace(tracer, visitor=replace(tracer.visitor, deep=True), layers=False)
             for k in missing:

@@ -89,13 +89,22 @@ class LightRecord:
 
 
 class Seen(NamedTuple):
-    """Emission that is found without chance along one way from a boundary: mirrored, or behind an object.
-    `light`: of that way, with the throughput. `found`: whether it is found; behind an object the number of boundaries
-    on the way of a path without events, behind which it is. `kept`: probability that a path does not take that way, or
-    that a first flight does not leave; 1 where it may meet surfaces there."""
+    """Emission that is found without chance along one way from a boundary.
+    `light`: of that way, with the throughput. `found`: whether it is found. `kept`: probability that a path does not
+    take that way; 1 where it may meet surfaces there."""
 
     light: mi.Spectrum
-    found: mi.Bool | mi.UInt32
+    found: mi.Bool
+    kept: mi.Spectrum
+
+
+class SeenThrough(NamedTuple):
+    """Emission that is found without chance behind an object, on the way of a path without events.
+    `light`: with the throughput. `exits`: boundaries on that way, behind which it is found. `kept`: probability that a
+    first flight does not leave; 1 where it may meet surfaces there."""
+
+    light: mi.Spectrum
+    exits: mi.UInt32
     kept: mi.Spectrum
 
 
@@ -491,12 +500,12 @@ class LightVisitor:
 
     def seen_emitters(
         self, walk: Walk, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32, active: mi.Bool
-    ) -> tuple[Seen, Seen]:
+    ) -> tuple[Seen, SeenThrough]:
         """What object k mirrors, and what is seen through it; added whatever is chosen, it must not count again.
         Only where light inside or leaving is known: beside light that is met by chance, of an even sky above all, the
         choice between both sides of the boundary has less noise. `active`: whether emitters are looked for; where a
         path has scattered, cones of delta lights are met instead."""
-        unseen = Seen(mi.Spectrum(0), mi.UInt32(0), mi.Spectrum(1))
+        unseen = SeenThrough(mi.Spectrum(0), mi.UInt32(0), mi.Spectrum(1))
         if self.unscattered is None and self.outgoing is None:
             return Seen(mi.Spectrum(0), mi.Bool(False), mi.Spectrum(1)), unseen
         smooth = ~self.media.row("rough", k)
@@ -516,7 +525,7 @@ class LightVisitor:
         F = mi.Spectrum(self.media.reflected(k, si)) if self.media.tinted else value
         return Seen(walk.weight * value * L_e, active, dr.select(nothing, 1 - F, 1))
 
-    def emitter_behind(self, walk: Walk, si: mi.SurfaceInteraction3f, k: mi.Int32, active: mi.Bool) -> Seen:
+    def emitter_behind(self, walk: Walk, si: mi.SurfaceInteraction3f, k: mi.Int32, active: mi.Bool) -> SeenThrough:
         """What is seen through object k without an event inside, which no free flight then meets.
         The light is (1 - F) Σ_j T_j F_1 ... F_{j-1} (1 - F_j) L_e, F of the boundary, F_j of the j-th on the way inside
         and T_j the transmittance up to it; of first flights 1 - T_1 (1 - F_1) are kept."""
@@ -533,14 +542,14 @@ class LightVisitor:
 
         # ---- what is seen at those after reflections inside, as far as there is light
         if not self.follows:
-            return Seen(way.light, way.exits, dr.select(nothing, 1 - passed, 1))
+            return SeenThrough(way.light, way.exits, dr.select(nothing, 1 - passed, 1))
         least = opaque(LEAST_REFLECTED) * dr.max(walk.weight * value)
 
         def on(way: WayThrough) -> mi.Bool:
             return way.going & (way.exits <= REFLECTIONS) & (dr.max(way.throughput) > least)
 
         way = dr.while_loop((way,), on, lambda way: (self._seen_at_boundary(way, k, walk.rng)[0],), label="behind")[0]
-        return Seen(way.light, way.exits, dr.select(nothing, 1 - passed, 1))
+        return SeenThrough(way.light, way.exits, dr.select(nothing, 1 - passed, 1))
 
     def _seen_at_boundary(self, way: WayThrough, k: mi.Int32, rng: mi.PCG32) -> tuple[WayThrough, mi.Spectrum, mi.Bool]:
         """The way through object k behind the next boundary, T (1 - F') there, and whether nothing is met beyond."""
@@ -904,9 +913,9 @@ class PathTracer:
             again = light.sighted & enters & same & self.visitor.straight_light.passes_again(near)
         light = replace(light, L=L, previous=dr.select(again, light.previous, si.p), sighted=again,
                         pdf=dr.select(again, light.pdf, bs.pdf), delta=delta & ~again, scattered=scattered,
-                        precomputed=dr.select(enters, seen.found > 0, mirrored.found),
+                        precomputed=dr.select(enters, seen.exits > 0, mirrored.found),
                         run=light.run and light.run.ended(), shallow=held & enters if self.visitor.splits else (),
-                        exits=dr.select(enters, seen.found, 0) if self.visitor.follows else ())  # fmt: skip
+                        exits=dr.select(enters, seen.exits, 0) if self.visitor.follows else ())  # fmt: skip
         if behind is not None:
             L = L + self.visitor.spread_inner_lights(walk, scattered & enters)
             light = replace(light, delta=~again & (delta | enters | through | behind.unlit), L=L)
@@ -940,7 +949,7 @@ class PathTracer:
 
     def _seen(
         self, L: mi.Spectrum, p: CameraPath, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32, active: mi.Bool
-    ) -> tuple[Seen, Seen, mi.Spectrum, CameraPath]:
+    ) -> tuple[Seen, SeenThrough, mi.Spectrum, CameraPath]:
         """What object k mirrors, and what is seen through it, and the light with both, at first told apart."""
         # emission that rays find lacks delta lights: where a path has scattered, it meets their cones instead
         small = self.visitor.small
