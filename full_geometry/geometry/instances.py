@@ -280,6 +280,11 @@ class InstanceScene:
         dr.make_opaque(tables)
         return cls(shapes, tables, bounds_of([*shapes, *(i for group in shown for i in group.instances)], shown))
 
+    def measure(self, scene: mi.Scene) -> None:
+        """Take the bounds of a scene without instances anew, once shapes have moved: objects that have not are kept."""
+        object.__setattr__(self, "bounds", bounds_of(scene.shapes()))
+        object.__setattr__(self, "lamps", lamps_of(scene))
+
     def rounding(self, si: mi.SurfaceInteraction3f) -> mi.Float:
         """A bound of how far from the surface that a ray has met rounding has put `si.p`."""
         more = place_bound(si.p) + OF_WAY * EPSILON * dr.select(si.is_valid(), si.t, 0)

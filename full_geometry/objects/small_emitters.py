@@ -277,12 +277,14 @@ def is_delta(emitter: mi.Emitter) -> bool:
 
 
 def check_emitters(scene: mi.Scene) -> None:
-    """Refuse emitters that do not work, and warn of those that no path from a camera finds.
+    """Refuse emitters that do not work, and warn of those that no path from a camera finds; the others learn how far
+    the scene reaches, which Mitsuba tells them when it is loaded, not when shapes have moved.
     ValueError for an emitter that Mitsuba's own path tracers cannot evaluate either, for light that is not finite, an
     environment that is stretched, or as of `check_lamps`."""
     check_lamps(scene)
     for emitter in scene.emitters():
         _check_finite(emitter)
+        emitter.set_scene(scene)  # shadow rays to an infinite one end where it was told that the scene ends
         parameters = mi.traverse(emitter)
         if emitter.is_environment() and "to_world" in parameters:  # else what is sampled is not what rays meet
             check_stretch(f"emitter {emitter.id()!r}", parameters["to_world"])

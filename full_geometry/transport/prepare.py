@@ -186,6 +186,8 @@ class TranslucentObjects:
             results = [obj.geometry for obj in objects]
             current = not any(geometry.inclusions for geometry in results) and not find_inclusions(scene, results)
             current = current and not objects[0].instance_scene.shapes
+            if current:
+                objects[0].instance_scene.measure(scene)
         if current:
             check_sensors(scene, [obj.geometry for obj in objects])
         else:

@@ -11,6 +11,8 @@ pytestmark = pytest.mark.usefixtures("rgb", "little_light")
 
 mi = pytest.importorskip("mitsuba")
 
+from full_geometry.geometry.instances import InstanceScene  # noqa: E402
+
 
 def _looking(origin: list) -> mi.ScalarTransform4f:
     return mi.ScalarTransform4f().look_at(origin, [0, 0, 0], [0, 1, 0])
@@ -87,3 +89,32 @@ def test_an_integrator_sees_emitters_that_were_added_and_removed(integrator: str
         fresh = mi.load_dict(_scene(integrator, lights))
         other = np.array(mi.render(fresh, integrator=found.integrator(), spp=64, seed=1))
         np.testing.assert_allclose(other, _image(fresh), rtol=1e-5)  # light on cells is summed in any order
+
+
+@pytest.mark.parametrize("integrator", [WALK, BSSRDF])
+def test_a_wall_that_moves_beyond_the_scene_blocks_the_sun(integrator: str) -> None:
+    """Mitsuba tells a sun how far the scene reaches when it is loaded, and there shadow rays to it would end."""
+    at, black = mi.ScalarTransform4f(), {"type": "diffuse", "reflectance": 0.0}
+    wall = {"type": "rectangle", "to_world": at.translate([5, 0, 0]), "bsdf": black}
+    sun = {"type": "directional", "direction": [0, 0, -1], "irradiance": 1.0}
+    scene = mi.load_dict(_scene(integrator, {"wall": wall, "sun": sun}))
+    edited = mi.traverse(scene)
+    assert _image(scene).max() > 0
+    edited["wall.to_world"] = mi.Transform4f(at.translate([0, 0, 100]).scale(50))
+    edited.update()
+    assert _image(scene).max() == 0
+
+
+def test_bounds_of_rounding_are_those_of_shapes_where_they_are_now() -> None:
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1e5]).scale(1e6)}
+    scene = mi.load_dict(_scene(BSSRDF, {"floor": floor, "lamp": EMITTERS["area"](False)}))
+    (before,) = scene.integrator().prepare(scene)
+    edited = mi.traverse(scene)
+    edited["floor.to_world"] = mi.Transform4f().translate([0, 0, -2])
+    edited["lamp.to_world"] = mi.Transform4f().translate([30, 0, 40])
+    edited.update()
+    (after,) = scene.integrator().prepare(scene)
+    wanted = InstanceScene.of(scene, [])
+    assert after is before  # whose matrices and networks stay
+    for name in ("bounds", "lamps"):
+        np.testing.assert_array_equal(getattr(after.instance_scene, name), getattr(wanted, name))
