@@ -100,6 +100,7 @@ def _about(k: int, d: np.ndarray, energy: np.ndarray, total: float) -> Sun | Non
 LARGEST = 0.5  # radius of an emitter over its distance
 NARROW = 0.01  # radius of the cone of a delta light that directions are sampled about, radians
 WIDE = 0.05  # and of one that is left to chance
+LEAST_BALL, DARK_BALL = 2e-3, 2.4e-4  # radians, below which the cone about a sphere is rounded by 1 %, and is none
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,6 +285,7 @@ def check_emitters(scene: mi.Scene) -> None:
     check_lamps(scene)
     for emitter in scene.emitters():
         _check_finite(emitter)
+        _warn_of_rounding(scene, emitter)
         emitter.set_scene(scene)  # shadow rays to an infinite one end where it was told that the scene ends
         parameters = mi.traverse(emitter)
         if emitter.is_environment() and "to_world" in parameters:  # else what is sampled is not what rays meet
@@ -296,6 +298,24 @@ def check_emitters(scene: mi.Scene) -> None:
         if emitter.flags() & int(mi.EmitterFlags.Delta) and not is_delta(emitter):
             message = f"light of a {kind} is left out: it can neither be sampled nor met, as by path tracers of Mitsuba"
             warnings.warn(message, stacklevel=2)
+
+
+def _warn_of_rounding(scene: mi.Scene, emitter: mi.Emitter) -> None:
+    """Warn of a spherical lamp that looks so small from an object that 1 - cos of its cone is rounded."""
+    ball = emitter.get_shape()
+    if ball is None or ball.class_name() != "Sphere":
+        return
+    centre, half = (np.ravel(np.array(v, dtype=float)) for v in (ball.bbox().center(), 0.5 * ball.bbox().extents()))
+    for shape in filter(surface_of, scene.shapes()):
+        low, high = (np.ravel(np.array(v, dtype=float)) for v in (shape.bbox().min, shape.bbox().max))
+        angle = float(half.max() / np.linalg.norm(np.maximum(np.abs(low - centre), np.abs(high - centre))))
+        if angle < LEAST_BALL:
+            told = "its light is lost" if angle < DARK_BALL else "its light is up to 7 % off"
+            warnings.warn(
+                f"the spherical lamp {ball.id()!r} should be seen under {LEAST_BALL:g} radians at least, got "
+                f"{angle:.2g} from object {shape.id()!r}: {told} by rounding in Mitsuba; a point light keeps it",
+                stacklevel=3,
+            )
 
 
 def check_sampled(scene: mi.Scene) -> None:

@@ -62,7 +62,7 @@ def _incident(
     # ---- by the emitters, L without its density; delta lights have no other technique
     ds, light = scene.sample_emitter_direction(si, u, False)
     shadow = instance_scene.ray_to_emitter(si, ds, rounding)
-    delta, active = mi.Bool(ds.delta), ds.pdf > 0
+    delta, active = mi.Bool(ds.delta), (ds.pdf > 0) & (ds.pdf < dr.inf)
     light = dr.select(active & ~blocked(scene, shadow, active), light * ds.pdf, 0)
 
     # ---- by the cosine

@@ -27,9 +27,10 @@ MOST_SURVIVAL = 0.99  # of Russian roulette; of 0.95, what glass reflects a hund
 
 
 def mis_weight(pdf: mi.Float, other: mi.Float) -> mi.Float:
-    """The balance heuristic, pdf / (pdf + other): weight of a sample of one density against a technique of another."""
+    """The balance heuristic, pdf / (pdf + other): weight of a sample of one density against a technique of another.
+    It is 1 where the first density overflows, as of a bulb that is seen from the horizon."""
     total = pdf + other
-    return dr.select(total > 0, pdf / dr.maximum(total, 1e-30), 0)
+    return dr.select(pdf == dr.inf, 1, dr.select(total > 0, pdf / dr.maximum(total, 1e-30), 0))
 
 
 def survival(size: mi.Float, depth: mi.UInt32, rr_depth: int) -> mi.Float:

@@ -33,6 +33,7 @@ LARGEST_ERROR = 0.02  # of the mean of an image: what a comparison could still m
 RUNS, PIXELS = 12, 6
 PLACE, RADIANS = np.array([1.5, 3.0, 2.5]), 0.15
 FAR = 300.0
+WAYS = ("translucent_walk", "sampled"), ("translucent_walk", "precomputed"), ("bssrdf", "sampled")
 
 
 def _looking(origin: np.ndarray) -> mi.ScalarTransform4f:
@@ -286,6 +287,20 @@ def test_models_refuse_emitters_that_are_never_sampled(light: str) -> None:
     scene = mi.load_dict(_scene({"type": "bssrdf", "light": light}, lights, model="better_dipole"))
     with pytest.raises(ValueError, match="sampling_weight must be > 0 for bssrdf, got 0 of emitter"):
         mi.render(scene, spp=1)
+
+
+@pytest.mark.usefixtures("little_light")
+@pytest.mark.parametrize(("integrator", "light"), WAYS)
+def test_a_bulb_so_far_that_its_density_overflows_leaves_no_nan(integrator: str, light: str) -> None:
+    lamp = {"type": "area", "radiance": 3e7}
+    bulb = {"type": "sphere", "center": [0.0, 50.0, 20.0], "radius": 0.005, "emitter": lamp}
+    wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -2])}
+    lights = {"bulb": bulb, "wall": wall, "sky": {"type": "constant", "radiance": 0.5}}
+    scene = mi.load_dict(_scene({"type": integrator, "light": light}, lights))
+    with pytest.warns(UserWarning, match="0.002 radians at least, got 9.*e-05 from object 'object': its light is lost"):
+        image = np.array(mi.render(scene, spp=16, seed=1))
+    assert np.isfinite(image).all()
+    assert image.mean() > 0
 
 
 @pytest.mark.parametrize("turned", [0.0, 180.0], ids=["copies", "back to back"])
