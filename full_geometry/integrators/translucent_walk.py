@@ -236,11 +236,11 @@ def walk_integrator_class() -> type:
             return light if light is not None and known == light_state(scene) else None
 
         def _glints_in(self, scene: mi.Scene, tracer: PathTracer, sensor: mi.Sensor, rays: int) -> Glints | None:
-            """`glints_of` by so many rays, the same for a view; None where that emission is met by chance.
+            """`glints_of` by so many rays, the same for a view; None where that emission is met by chance or not.
 
             Only of box filters, which do not ask where in a pixel light is.
             """
-            if tracer.visitor.unscattered is None or not sensor.film().rfilter().is_box_filter():
+            if not tracer.mirrors or tracer.visitor.unscattered is None or not sensor.film().rfilter().is_box_filter():
                 return None
             trial = trial_of(rays, sensor)
             state = trial, Snapshot(sensor), light_state(scene)

@@ -721,6 +721,11 @@ class PathTracer:
     within: int = 0
     brightest: mi.Float | None = None
 
+    @property
+    def mirrors(self) -> int:
+        """Mirrors of objects in which the first surface finds emission: no more than a path may have vertices."""
+        return min(MIRRORS, self.max_depth - 1)
+
     def trace(
         self,
         rays: mi.Ray3f,
@@ -800,7 +805,7 @@ class PathTracer:
     def seen_emission(self, rays: mi.Ray3f) -> mi.Spectrum:
         """Emission that rays see in the mirror of the object that they meet first, and behind it: a part of `trace`."""
         walk = start_walk(rays.o, rays.d, generator(mi, dr.width(rays), pass_seed(0)))
-        return self._mirrored(walk, dr.full(mi.Bool, True, dr.width(rays)), MIRRORS)
+        return self._mirrored(walk, dr.full(mi.Bool, True, dr.width(rays)), self.mirrors)
 
     def mirrored(self, rays: mi.Ray3f) -> tuple[mi.Point3f, mi.Vector3f, mi.Bool]:
         """Where rays go on from the objects that they meet first, along what smooth boundaries mirror; whether any."""
@@ -972,7 +977,7 @@ class PathTracer:
         return mirrored, behind, L + light, p
 
     def _in_mirror(self, light: mi.Spectrum, walk: Walk, active: mi.Bool) -> tuple:
-        return light + self._mirrored(walk, active, MIRRORS - 1), walk, active
+        return light + self._mirrored(walk, active, self.mirrors - 1), walk, active
 
     def _passed(self, before: mi.Bool | tuple[()], walk: Walk) -> mi.Bool | tuple[()]:
         """Whether a path has been inside an object, and scattered there where light passes clear ones."""

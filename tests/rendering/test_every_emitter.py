@@ -303,6 +303,17 @@ def test_a_bulb_so_far_that_its_density_overflows_leaves_no_nan(integrator: str,
     assert image.mean() > 0
 
 
+@pytest.mark.usefixtures("little_light")
+def test_paths_of_one_vertex_show_no_lamp_in_a_mirror() -> None:
+    lamp = {"type": "sphere", "center": [1, 2, 5], "radius": 0.3, "emitter": {"type": "area", "radiance": 90.0}}
+    walk = {"type": "translucent_walk", "light": "precomputed"}
+    found = [
+        _means(_scene({**walk, "max_depth": depth}, {"lamp": lamp}, reflection=True), 64, 1, 1) for depth in (1, 2)
+    ]
+    assert found[0].max() == 0
+    assert found[1].min() > 0
+
+
 @pytest.mark.parametrize("turned", [0.0, 180.0], ids=["copies", "back to back"])
 @pytest.mark.parametrize("integrator", ["translucent_walk", "bssrdf"])
 def test_lamps_on_each_other_are_refused_by_name(integrator: str, turned: float) -> None:
