@@ -105,7 +105,7 @@ def outcome(record: dict[str, object]) -> dict[str, object]:
     results |= {"way": option.way, "spp": option.spp, "error": math.sqrt(error2)}
     results |= {"error_standard_error": error2_error / (2 * math.sqrt(error2)), "cost_s": cost}
     results |= {"cheapest": cheapest, "cheapest_s": least[cheapest], "ratio": cost / least[cheapest]}
-    results |= {"sure_ratio": cost / sure}
+    results |= {"sure_ratio": cost / sure, "technique_ratio": least[option.way] / least[cheapest]}
     results["keeps"] = error2 - 2 * error2_error <= scene.tolerance**2
     return results | {f"{name}_s": least.get(name, math.inf) for name in WAYS}
 

@@ -40,6 +40,7 @@ def summary(records: Sequence[JsonDict]) -> JsonDict:
     results: JsonDict = {"scenes": len(table), "kept": int(table["keeps"].sum()), "cheap": int(cheap.sum())}
     results |= {"kept_and_cheap": int((table["keeps"] & cheap).sum())}
     results |= {"surely_cheap": int((table["sure_ratio"] <= DEAR).sum())}
+    results |= {"cheap_techniques": int((table["technique_ratio"] <= DEAR).sum())}
     results["not_kept"] = [int(n) for n in table.loc[~table["keeps"], "number"]]
     results["dear"] = [int(n) for n in table.loc[~cheap, "number"]]
     results["assess_s"] = float(table["seconds"].max())
@@ -97,8 +98,9 @@ def markdown(values: JsonDict, table: pandas.DataFrame, how: JsonDict) -> str:
         INTRODUCTION.format(arguments=f"`{arguments}`", ways=len(WAYS), **{k: how[k] for k in ("assess", "truth")}),
         f"{values['kept']} of {n} recommendations keep their tolerance (within two standard errors of the long run), "
         f"{values['cheap']} cost at most {DEAR:g} times the cheapest way that does by the long run, "
-        f"{values['surely_cheap']} of the cheapest with the doubt that a recommendation counts; an assessment took at "
-        f"most {values['assess_s']:.2g} s of the processor, compilation left out.",
+        f"{values['surely_cheap']} of the cheapest with the doubt that a recommendation counts. Stopped as soon as it "
+        f"keeps the tolerance by the long run, the technique costs that in {values['cheap_techniques']}. An assessment "
+        f"took at most {values['assess_s']:.2g} s of the processor, compilation left out.",
         "",
         f"(bias² of the assessment - bias² of the long run) over their standard errors, {z['count']} pairs: mean "
         f"{z['mean']:+.2f}, standard deviation {z['sd']:.2f}, {100 * z['beyond_2']:.1f} % beyond 2, "

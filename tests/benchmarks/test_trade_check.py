@@ -43,5 +43,6 @@ def test_a_scene_that_was_measured_is_not_measured_again(tmp_path: Path, monkeyp
     assert (
         found["way"] in ("path_traced", "lambert")
         and found["ratio"] >= found["sure_ratio"] > 0
+        and found["technique_ratio"] >= 1
         and len(trade_check.z_values(first)) == 1
     )
