@@ -45,7 +45,7 @@ def bench_renders(variant: str, size: int, training: float = 0.0, spp: int = SPP
         spp: samples of a pixel in each of `PASSES` images, of a learnt object 16 at most.
     """
     use_mitsuba(variant)
-    from benchmarks.speeds import VOLUMES, LitObject, scene_of, train
+    from benchmarks.lit_objects import VOLUMES, LitObject, scene_of, train
     from benchmarks.total_error import PRECOMPUTED, image_of_pass, lit_scene
     from full_geometry.trade.denoising import cover
     from halfspace_sss.backend import clock
@@ -100,7 +100,7 @@ def bench_edits(variant: str, size: int) -> Iterator[Row]:
     use_mitsuba(variant)
     import mitsuba as mi
 
-    from benchmarks.speeds import LitObject
+    from benchmarks.lit_objects import LitObject
     from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
 
     case = LitObject(*EDITED)
@@ -159,7 +159,7 @@ def bench_first_images(variant: str, size: int, training: float = TRAINING) -> I
     Imports, the scene and the image of 16 samples a pixel count; a `full_geometry` is trained before.
     """
     use_mitsuba(variant)
-    from benchmarks.speeds import LitObject, train
+    from benchmarks.lit_objects import LitObject, train
 
     with TemporaryDirectory() as weights:
         for way in FIRST:
@@ -191,7 +191,7 @@ def first_image(variant: str, size: int, way: str, folder: str) -> None:
     use_mitsuba(variant)
     import mitsuba as mi
 
-    from benchmarks.speeds import LitObject
+    from benchmarks.lit_objects import LitObject
     from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
 
     model, _, light = way.partition(", ")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import pandas
 
-from benchmarks.speeds import LitObject, scene_of, train
+from benchmarks.lit_objects import LitObject, scene_of, train
 from benchmarks.timed import rendered
 from figures.computing.contenders import WALK
 from figures.computing.scans import prepare
@@ -31,7 +31,7 @@ class Comparing:
     """What is compared.
 
     Args:
-        models: of `speeds.MODELS`.
+        models: of `lit_objects.MODELS`.
         spp: samples of a pixel of sampled images and of walks, an eighth for each gathering; at least 16.
         gatherings: by different seeds, at least 2.
         size: pixels of the square images.

@@ -9,7 +9,6 @@ import numpy as np
 from figures.computing.contenders import WALK
 from figures.computing.scans import scan_scene
 from figures.parts.part import SceneDict
-from halfspace_sss import bssrdf
 from halfspace_sss.physics.medium import Medium
 
 if TYPE_CHECKING:
@@ -27,22 +26,16 @@ def volume(rr_depth: int) -> str:
 VOLUMES = tuple(volume(rr_depth) for rr_depth in RR_DEPTHS)
 
 
-def contender(
-    method: str, material: str, size: int, lights: str, bare: bool = False, sampler: str = "independent",
-    scan: str = "bunny",
-) -> mi.Scene | tuple[mi.Scene, ...]:  # fmt: skip
-    """The scene of a scanned object for a method, see `ready`.
-    `method`, `bare`: as in `ready`. `material`, `size`, `lights`, `sampler`, `scan`: as in
-    `figures.computing.scans.scan_scene`. ValueError if there is no such method, material or lights."""
+def contender(method: str, material: str, size: int, lights: str) -> mi.Scene | tuple[mi.Scene, ...]:
+    """The scene of the bunny for a method.
+    `method`: as in `ready`. `material`, `size`, `lights`: as in `figures.computing.scans.scan_scene`. ValueError if
+    there is no such method, material or lights."""
     from halfspace_sss import materials
 
-    description = scan_scene(material, size, lights, scan, sampler)
-    return ready(method, description, scan, materials.load(material).medium, bare)
+    return ready(method, scan_scene(material, size, lights), "bunny", materials.load(material).medium)
 
 
-def ready(
-    method: str, description: SceneDict, name: str, medium: Medium, bare: bool = False
-) -> mi.Scene | tuple[mi.Scene, ...]:
+def ready(method: str, description: SceneDict, name: str, medium: Medium) -> mi.Scene | tuple[mi.Scene, ...]:
     """The Mitsuba scene for a method, or three, one for each channel; `timed.rendered` takes both.
 
     Mitsuba's media have one phase function for all channels: it is given the channels of others one by one.
@@ -51,7 +44,6 @@ def ready(
         method: a name in `VOLUMES`, `WALK`, or a model; `full_geometry` must have been trained.
         description: of the scene, with millimetres of its unit in the integrator; it is changed.
         medium: of the object, 1/mm; of one that varies any with its mean cosine.
-        bare: whether a model is left without surface reflection and without the single scattering that it lacks.
 
     Raises:
         ValueError: no such method.
@@ -62,10 +54,7 @@ def ready(
         return _volume_scene(description, name, medium, int(method.split()[1]))
     if method == WALK:
         return load_scene(description, PATH_TRACED)
-    if not bare:
-        return load_scene(description, method)
-    description[name]["bsdf"]["reflection"] = False
-    return load_scene(description, method, bssrdf(method, medium).orders)
+    return load_scene(description, method)
 
 
 def _volume_scene(description: SceneDict, name: str, medium: Medium, rr_depth: int) -> mi.Scene | tuple[mi.Scene, ...]:
@@ -81,13 +70,3 @@ def _volume_scene(description: SceneDict, name: str, medium: Medium, rr_depth: i
         one = {**description[name], "bsdf": {"type": "translucent", **values}}
         results.append(with_media({**description, name: one}, mm_per_unit, integrator))
     return tuple(results)
-
-
-def label(method: str) -> str:
-    """The name of a method as people read it."""
-    if method in VOLUMES:
-        kind, rr_depth = method.split()
-        return f"Mitsuba {kind}, roulette from {rr_depth}"
-    from figures.drawing import image_grid
-
-    return image_grid.label(method)

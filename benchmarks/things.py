@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.methods import label
 from figures.computing.contenders import against, reference_image, reference_shot
 from figures.computing.images import Shot
 from figures.computing.scans import prepare
+from figures.drawing.image_grid import label
 from figures.parts.part import Params, Part, Result, SceneDict, Task
 
 

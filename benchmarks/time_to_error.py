@@ -21,7 +21,7 @@ import mitsuba as mi
 import numpy as np
 import pandas
 
-from benchmarks.speeds import VOLUMES, LitObject
+from benchmarks.lit_objects import VOLUMES, LitObject
 from benchmarks.total_error import BLOCK, PRECOMPUTED, image_of_pass, lit_scene
 from figures.computing.scans import prepare
 from figures.parts.part import Row

@@ -24,8 +24,8 @@ import mitsuba as mi
 import numpy as np
 import pandas
 
+from benchmarks.lit_objects import VOLUMES, LitObject
 from benchmarks.methods import ready
-from benchmarks.speeds import VOLUMES, LitObject
 from figures.computing.scans import prepare
 from figures.parts.part import Row
 from full_geometry.geometry.sensors import sampled_size

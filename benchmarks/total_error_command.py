@@ -16,7 +16,7 @@ from halfspace_sss.cli.shared import Bar, OutFolder, console, whole
 from halfspace_sss.provenance import check_folder, write_together
 
 if TYPE_CHECKING:
-    from benchmarks.speeds import LitObject
+    from benchmarks.lit_objects import LitObject
 
 __all__ = ["time_to_error_command", "total_error_command"]
 
@@ -30,15 +30,16 @@ class LitOptions:
     """Which objects, each in which lights."""
 
     objects: Annotated[
-        list[str] | None, typer.Option("--object", help="As of `speeds`; repeat for more.", show_default="of the study")
+        list[str] | None,
+        typer.Option("--object", help="As of `gathered`; repeat for more.", show_default="of the study"),
     ] = None
     light: Annotated[
-        list[str] | None, typer.Option(help="As of `speeds`; repeat for more.", show_default="of the study")
+        list[str] | None, typer.Option(help="As of `gathered`; repeat for more.", show_default="of the study")
     ] = None
 
     def cases(self, objects: Sequence[str], lights: Sequence[str]) -> list[LitObject]:
         """Each object in each light, of those where none is named; ValueError if there is no such one."""
-        from benchmarks.speeds import ALL_LIGHTS, LitObject
+        from benchmarks.lit_objects import ALL_LIGHTS, LitObject
 
         lights = tuple(self.light or lights)
         for name in lights:

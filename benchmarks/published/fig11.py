@@ -6,13 +6,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from benchmarks.methods import VOLUMES, contender, label
+from benchmarks.methods import VOLUMES, contender
 from benchmarks.timed import TimedRender, alternating, pass_size
 from figures.computing.contenders import MODELS, NOTE, OF_OBJECTS, WALK, against, long_reference, reference_shot
 from figures.computing.images import FLIP, RELATIVE_MSE, Shot
 from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training_of, weight_files, with_weights
 from figures.computing.scans import BUNNY, prepare
-from figures.drawing.image_grid import image_files
+from figures.drawing.image_grid import image_files, label
 from figures.parts.part import Part, Result, Row, Task
 from full_geometry.trade.denoising import check_denoiser, denoised, guides
 from halfspace_sss import materials

@@ -9,12 +9,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from benchmarks.methods import label
 from benchmarks.published import fig07
 from benchmarks.tables import in_markdown
 from figures.computing.contenders import OF_OBJECTS
 from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training_of, weight_files
 from figures.computing.scans import BUNNY, MATERIALS
+from figures.drawing.image_grid import label
 from figures.fig09 import LIGHTS, rendered
 from figures.parts.part import Part, Result, Row
 from halfspace_sss import materials

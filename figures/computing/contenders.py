@@ -35,9 +35,11 @@ def gathered_anew(scene: mi.Scene) -> float:
 
 
 def long_walk(task: Task) -> dict[str, object]:
-    """A long image by our walk, in passes that survive an interruption: what the other images are compared with.
-    The parameters of the task are material, size, lights, spp, seed and, unless it is the bunny, scan."""
-    return long_passes(task, _walked(task))
+    """A long image by our walk: what the other images are compared with.
+    Its passes, of which each has an eighth of the samples at most, survive an interruption. The parameters of the task
+    are material, size, lights, spp and seed."""
+    each = min(max(task.params["spp"] // 8, 1), LONG_PASS)
+    return long_render(task, _walked(task), each, max(task.params["spp"] // each, 2))
 
 
 def _walked(task: Task) -> mi.Scene:
@@ -46,13 +48,7 @@ def _walked(task: Task) -> mi.Scene:
 
     prepare()
     p = task.params
-    return load_scene(scan_scene(p["material"], p["size"], p["lights"], p.get("scan", "bunny")), PATH_TRACED)
-
-
-def long_passes(task: Task, scene: mi.Scene) -> dict[str, object]:
-    """`long_render` of the samples per pixel "spp" of a task, in passes that are its eighth at most."""
-    each = min(max(task.params["spp"] // 8, 1), LONG_PASS)
-    return long_render(task, scene, each, max(task.params["spp"] // each, 2))
+    return load_scene(scan_scene(p["material"], p["size"], p["lights"]), PATH_TRACED)
 
 
 # ---- References ----

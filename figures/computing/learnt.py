@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from figures.computing.scans import BUNNY, MM_PER_UNIT, SCANS, prepare, scan_scene
+from figures.computing.scans import BUNNY, MM_PER_UNIT, prepare, scan_scene
 from figures.parts.part import Part, Result, SceneDict, Task
 from halfspace_sss import materials
 from halfspace_sss.neural.store import weights_in
@@ -53,18 +53,17 @@ def with_weights(folder: Path, needed: Mapping[str, Result]) -> Iterator[None]:
 CHUNKS = {"draft": 2, "paper": 8}  # of all figures, which share parts; seconds would depend on what else runs
 
 
-def train_scan(name: str, material: str, chunks: int, scan: str = "bunny") -> Part:
-    """The part in which a scanned object of a material is learnt by so many chunks of data.
+def train_scan(name: str, material: str, chunks: int) -> Part:
+    """The part in which the bunny of a material is learnt by so many chunks of data.
     `name`: of what is learnt, by which `training_of` finds it. `material`: in the registry. `chunks`: see
-    `full_geometry.learning.training.train_unattended`. `scan`: name in `scans.SCANS`."""
-    params = {"scan": scan, "material": material, "chunks": chunks, "seed": 0, "model": FULL_GEOMETRY}
-    return Part(training_of(name), _scanned, params, chunks, inputs=(SCANS[scan].file,))
+    `full_geometry.learning.training.train_unattended`."""
+    params = {"material": material, "chunks": chunks, "seed": 0, "model": FULL_GEOMETRY}
+    return Part(training_of(name), _scanned, params, chunks, inputs=(BUNNY,))
 
 
 def _scanned(task: Task) -> dict[str, object]:
     prepare()
-    p = task.params
-    return trained(task, scan_scene(p["material"], 16, "even sky", p["scan"]), p["scan"])
+    return trained(task, scan_scene(task.params["material"], 16, "even sky"), "bunny")
 
 
 def trained(task: Task, scene: SceneDict, name: str) -> dict[str, object]:

@@ -50,9 +50,7 @@ def prepare() -> None:
     gc.collect()
 
 
-def scan_scene(
-    material: str, size: int, lights: str = "both", scan: str = "bunny", sampler: str = "independent"
-) -> SceneDict:
+def scan_scene(material: str, size: int, lights: str = "both", scan: str = "bunny") -> SceneDict:
     """A translucent object on its own, as a dict for `scenes.scene_files.load_scene`, under its name.
 
     Args:
@@ -60,7 +58,6 @@ def scan_scene(
         lights: "both" for the small light and dim surroundings with two windows, "small light", or "even sky",
             radiance 1 from everywhere.
         scan: name in `SCANS`.
-        sampler: Mitsuba's plugin of random numbers; "multijitter" has less noise and takes square numbers of samples.
 
     Raises:
         ValueError: scan or lights is something else.
@@ -75,7 +72,7 @@ def scan_scene(
     scene: SceneDict = {
         "type": "scene",
         "integrator": {"type": "bssrdf", "mm_per_unit": result.mm_per_unit, "hide_emitters": True},
-        "sensor": {"type": "perspective", "fov": 26.0, "to_world": view, "film": film, "sampler": {"type": sampler}},
+        "sensor": {"type": "perspective", "fov": 26.0, "to_world": view, "film": film},
         scan: {
             "type": "ply",
             "filename": str(result.file),

@@ -58,7 +58,7 @@ def test_an_image_below_its_noise_is_infinitely_far_off() -> None:
 def test_precomputed_light_comes_nearer_to_the_reference_in_more_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from benchmarks.speeds import LitObject
+    from benchmarks.lit_objects import LitObject
     from full_geometry.trade.denoising import cover
 
     monkeypatch.setattr(module, "VOLUMES", module.VOLUMES[:1])

@@ -1,4 +1,4 @@
-"""What `speeds` and `gathered` compare."""
+"""What studies of errors and times render, and the errors of gathered light."""
 
 from __future__ import annotations
 
@@ -9,19 +9,8 @@ pytest.importorskip("mitsuba")
 
 from benchmarks.gathered_error import off  # noqa: E402
 from benchmarks.hand_and_ribbon import SHAPES  # noqa: E402
+from benchmarks.lit_objects import LitObject  # noqa: E402
 from benchmarks.modelling.meshes import surface  # noqa: E402
-from benchmarks.speeds import PASSES, LitObject, Measuring, _noise, ways_of  # noqa: E402
-from benchmarks.timed import TimedRender  # noqa: E402
-
-
-def test_noise_holds_light_that_most_pixels_have_not_met() -> None:
-    spp, chance, size = 16, 0.003, 64
-    met = np.random.default_rng(1).binomial(spp, chance, (PASSES, size, size, 3))
-    timed = TimedRender((met / (spp * chance)).astype(np.float32), PASSES * spp, (1.0,) * PASSES, (1.0,) * PASSES)
-    assert np.median(met.sum(axis=0)) == 0
-    variance, error = _noise(timed, np.ones((size, size), dtype=bool))
-    assert variance == pytest.approx(1 / chance - 1, rel=0.1)
-    assert 0 < error < 0.1
 
 
 def test_an_error_is_told_without_the_noise_of_samples() -> None:
@@ -35,14 +24,6 @@ def test_an_error_is_told_without_the_noise_of_samples() -> None:
     assert again.rms < 4 * again.error < 0.06
 
 
-def test_an_object_smaller_than_a_block_is_refused() -> None:
-    timed = TimedRender(np.ones((PASSES, 16, 16, 3), np.float32), PASSES * 16, (1.0,) * PASSES, (1.0,) * PASSES)
-    covered = np.zeros((16, 16), dtype=bool)
-    covered[4, 4] = True
-    with pytest.raises(ValueError, match="size must be larger"):
-        _noise(timed, covered)
-
-
 @pytest.mark.parametrize(
     ("thing", "light", "said"),
     [
@@ -54,11 +35,6 @@ def test_an_object_smaller_than_a_block_is_refused() -> None:
 def test_an_object_that_there_is_not_is_refused(thing: str, light: str, said: str) -> None:
     with pytest.raises(ValueError, match=said):
         LitObject(thing, light)
-
-
-def test_an_object_whose_medium_varies_has_no_ways_that_refuse_it() -> None:
-    ways = ways_of(LitObject("mandarin", "windows"), Measuring())
-    assert not [way for way in ways if "neural_shape" in way or "gathered" in way]
 
 
 @pytest.mark.parametrize("shape", SHAPES)
