@@ -62,15 +62,16 @@ def test_precomputed_light_comes_nearer_to_the_reference_in_more_time(
     from full_geometry.trade.denoising import cover
 
     monkeypatch.setattr(module, "VOLUMES", module.VOLUMES[:1])
-    monkeypatch.setattr(module, "PASSING", (*module.VOLUMES, module.SAMPLED, module.PRECOMPUTED))
+    monkeypatch.setattr(module, "PASSING", (*module.VOLUMES, module.PRECOMPUTED))
     monkeypatch.setattr(module, "MOST_SPP", 16)
     how, whole, kept = module.TotalErrors((0.25, 2.0), 4.0, 24), module._corrected, []
 
     def once(fresh: Any, limit: float, seed: int) -> Any:
         """16 samples for both times, which a slow machine would not reach."""
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(module, "LEAST_SPP", module.MOST_SPP)
-            kept[:] = kept or [whole(fresh, 60.0, seed)]
+        if not kept:
+            monkeypatch.setattr(module, "LEAST_SPP", module.MOST_SPP)
+            scene = fresh()  # its light is gathered once
+            kept.append(whole(lambda: scene, 60.0, seed))
         return kept[0]
 
     monkeypatch.setattr(module, "_corrected", once)
