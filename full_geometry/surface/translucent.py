@@ -326,7 +326,13 @@ def translucent_class() -> type:
             if repainted or (self.spec.constants and self.spec.textured is None):
                 values = {name: np.ravel(getattr(self, name)) for name in self.spec.constants}
                 self.spec = self.spec.changed(**values).with_variables(self)
-            check_eta(self.boundary, self.spec.medium.eta)
+            try:
+                check_eta(self.boundary, self.spec.medium.eta)
+            except ValueError:  # a render after the refusal is of the medium and the boundary before
+                boundary = mi.traverse(self.boundary)
+                boundary["eta"] = self.spec.medium.eta
+                boundary.update()
+                raise
 
         def _shown(self, ctx: mi.BSDFContext, value: mi.Spectrum) -> mi.Spectrum:
             return value if self.spec.reflection and ctx.component in (0, 0xFFFFFFFF) else 0 * value

@@ -177,3 +177,22 @@ def volume_image() -> np.ndarray:
     medium = {"type": "homogeneous", "sigma_t": 7.0, "albedo": 0.95, "phase": {"type": "isotropic"}}
     scene = mi.load_dict({**_tinted(interior=medium), "integrator": {"type": "volpathmis", "max_depth": -1}})
     return np.mean([np.array(mi.render(scene, spp=2048, seed=seed)).mean(axis=(0, 1)) for seed in range(6)], axis=0)
+
+
+@pytest.mark.parametrize("boundary", [None, {"type": "roughdielectric", "int_ior": 1.4, "ext_ior": 1.0, "alpha": 0.2}])
+def test_an_index_that_is_refused_leaves_the_boundary_of_the_medium(boundary: dict[str, Any] | None) -> None:
+    bsdf = {
+        "type": "translucent",
+        "sigma_t": 5.0,
+        "albedo": 0.9,
+        "eta": 1.4,
+        **({"edge": boundary} if boundary else {}),
+    }
+    ball = {"type": "sphere", "id": "ball", "bsdf": bsdf}
+    scene = mi.load_dict({"type": "scene", "ball": ball, "sky": {"type": "constant"}})
+    parameters = mi.traverse(scene)
+    (key,) = (key for key in parameters.keys() if key.endswith("boundary.eta"))
+    parameters[key] = 1.6
+    with pytest.raises((ValueError, RuntimeError), match="eta 1.4 of the medium"):
+        parameters.update()
+    assert float(np.ravel(mi.traverse(scene)[key])[0]) == pytest.approx(1.4, abs=1e-6)
