@@ -54,12 +54,15 @@ def check_scene(scene: RandomScene, folder: Path, seconds: float, truth_seconds:
 
 
 def _likely(scene: RandomScene, ways: list[Technique], quick: Assessment) -> list[Technique]:
-    """Ways that may be the cheapest, which have a long run."""
+    """Ways that may be the cheapest, and the advised one, which have a long run."""
+    advised = {o.way for o in advise(quick, Job(scene.tolerance, scene.images)).objects}
     rows = {row.way: row for o in quick.objects for row in o.ways if not row.refusal}
     plain = [way for way in ways if way.walks and not way.denoised and way.name in rows]
     noise = {way.name: rows[way.name].variance * rows[way.name].seconds for way in plain}
 
     def may_win(way: Technique) -> bool:
+        if way.name in advised:
+            return True
         if way.light == CORRECTED:
             return corrected_chance(scene.tolerance) > UNLIKELY
         name = replace(way, denoised=False).name

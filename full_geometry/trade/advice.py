@@ -215,6 +215,8 @@ def _told(assessed: ObjectTrade, option: _Raw, best: _Raw, job: Job) -> Option:
         why = f"{row.way} is the cheapest that keeps {job.tolerance:.3g} ({size}): {off}, {images} in {_time(took)}"
         why += f" with {int(spp)} {'sample' if spp == 1 else 'samples'} a pixel" + training
         why += f"; render {Technique.of(row.way).flags} --spp {int(spp)}"
+        if Technique.of(row.way).walks:
+            why += f", or --target-error {job.tolerance:g}, which stops by the error of the picture"
     elif took < math.inf:
         over = job.seconds is not None and took > job.seconds
         why = f"{row.way} takes {_time(took)}"

@@ -231,6 +231,14 @@ def test_every_way_gets_one_sentence() -> None:
     assert len(why) == len(found.options) == 5
 
 
+def test_walks_are_advised_to_stop_by_the_error_of_the_picture_too() -> None:
+    walks, model = (recommend(_assessment(CHEAP), tolerance=tolerance).objects[0] for tolerance in (0.02, 0.4))
+    assert walks.options[0].why.endswith(
+        f"--spp {walks.options[0].spp}, or --target-error 0.02, which stops by the error of the picture"
+    )
+    assert model.way == "lambert" and "--target-error" not in model.options[0].why
+
+
 def test_a_training_counts_once() -> None:
     trained = _way("full_geometry", 0.001, 0.001, 1e-9, training=60.0)
     found = _assessment(GOOD, trained)
