@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from full_geometry.geometry.points import EntrySample, SurfacePoint, lifted, opaque, place, turned
-from full_geometry.geometry.rounding import blocked, ray_from, ray_to
+from full_geometry.geometry.rounding import before, blocked, ray_from, ray_to
 from full_geometry.integrators.ballistic_and_single import RefractedRay, sample_one_event
 from full_geometry.integrators.lighting import PathRadiance, Primal, RenderContext, Replay, delta_light
 from full_geometry.integrators.specular_connections import outward_sign
@@ -246,9 +246,12 @@ def weighted_emission(
         emitter, mirrored = si.emitter(context.scene, active), active & previous.mirrored & scattered
         active = active & shown & (emitter != None)  # noqa: E711
         active &= ~(previous.environment_only & context.sampled_by_nee(emitter, ray.d))
-        # a direction drawn for one emitter counts that emitter only: at its distance
+        # a direction drawn for one emitter counts that emitter only: at its distance, but for rounding of its surface
         distance = previous.emitter_distance
-        there = dr.select(si.is_valid(), dr.abs(si.t - distance) < 1e-3 * distance, distance == dr.inf)
+        off, along = dr.abs(si.t - distance), dr.abs(dr.dot(si.n, ray.d))
+        e = before(si.p, distance, previous.e + context.instance_scene.rounding(si))
+        near = (off < 1e-3 * distance) | (off * along < e)
+        there = dr.select(si.is_valid(), near, distance == dr.inf)
         active &= (distance < 0) | there
         # p_f / (p_f + share p_e)
         origin, share = place(previous.p, previous.n), previous.emitter_share

@@ -114,6 +114,21 @@ def test_a_scene_is_the_same_anywhere(thing: tuple, integrator: dict[str, Any]) 
     assert abs(apart.mean()) < 4.5 * error + 1e-4
 
 
+def test_a_close_lamp_is_found_as_far_from_the_origin_as_at_it() -> None:
+    """Distances along rays that only graze it are rounded by more than a thousandth of the distance."""
+
+    def brightness(to: Frame) -> np.ndarray:
+        bsdf = {"type": "translucent", "sigma_t": "5", "albedo": "0.95", "eta": 1.4, "model": "better_dipole"}
+        lamp = {"type": "sphere", "center": to(2, 3, 1.5), "radius": 0.7, "emitter": {"type": "area"}}
+        scene = {"type": "scene", "integrator": MODEL, "ball": _ball(to, (1, 1, 1), bsdf), "lamp": lamp,
+                 "cam": to.camera((0, 1.5, 6), 20.0, 8)}  # fmt: skip
+        loaded = mi.load_dict(scene)
+        return np.array([np.array(mi.render(loaded, spp=512, seed=k)).mean() for k in range(4)])
+
+    near, far = brightness(Frame()), brightness(Frame((9600, -8000, 9920)))
+    assert abs(far.mean() / near.mean() - 1) < 0.03
+
+
 @pytest.mark.parametrize("kind", ["cube", "sphere", "cylinder", "disk", "rectangle", "bsplinecurve", "sdfgrid"])
 @pytest.mark.parametrize(
     "frame", [Frame(), Frame((1000, 300, 0)), Frame((1e3, 1e3, 1e3), 1e-3)], ids=["mm", "moved", "m, moved"]
