@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from halfspace_sss.checks import check_count, check_interval
+from halfspace_sss.checks import check_interval
 from halfspace_sss.progress import Progress
 
 if TYPE_CHECKING:
@@ -24,13 +24,11 @@ GROWTH, MOST_TRIALS = 16, 8  # of the number of samples of a pass that is looked
 class TimedRender:
     """Passes of a scene.
     `images`: of each pass, linear radiance, float32 (passes, H, W, 3). `spp`: samples per pixel of all together.
-    `pass_seconds`: of each pass, without compilation. `pass_cpu_seconds`: of all threads, which other work on the
-    machine does not lengthen."""
+    `pass_seconds`: of each pass, without compilation."""
 
     images: np.ndarray
     spp: int
     pass_seconds: tuple[float, ...]
-    pass_cpu_seconds: tuple[float, ...]
 
     @property
     def image(self) -> np.ndarray:
@@ -92,46 +90,33 @@ def _samples_in(seconds: float, result: list[tuple[int, float]]) -> int:
 
 
 def alternating(
-    scenes: Mapping[str, mi.Scene], spp: Mapping[str, int], seed: int, *, passes: int | None = None,
-    seconds: float | None = None, progress: Progress | None = None,
-) -> dict[str, TimedRender]:  # fmt: skip
-    """Render scenes in turn, a pass of each, until every one has its passes or its seconds.
+    scenes: Mapping[str, mi.Scene], spp: Mapping[str, int], seed: int, seconds: float, progress: Progress | None = None
+) -> dict[str, TimedRender]:
+    """Render scenes in turn, a pass of each, until every one has its seconds.
 
     Args:
         scenes: by name; compiled before, e.g. by `pass_size`.
         spp: of a pass, by name.
-        passes: of each scene.
         seconds: of each scene; it ends with the pass that comes nearest.
         progress: called with (done, in all).
 
     Raises:
-        ValueError: neither passes nor seconds is given, or one is out of range.
+        ValueError: seconds is out of range.
     """
-    if (passes is None) == (seconds is None):
-        raise ValueError(f"one of passes and seconds must be given, got {passes!r} and {seconds!r}")
-    check_count("passes", passes or 1, 1)
-    check_interval("seconds", seconds or 1.0, 1e-6, 1e6)
+    check_interval("seconds", seconds, 1e-6, 1e6)
     images: dict[str, list[np.ndarray]] = {name: [] for name in scenes}
     times: dict[str, list[float]] = {name: [] for name in scenes}
-    of_cpu: dict[str, list[float]] = {name: [] for name in scenes}
 
     def share(name: str) -> float:
         """Done of what is to be done; half a pass before the end of the time it is all done."""
         took = times[name]
-        if passes is not None:
-            return len(took) / passes
         return (sum(took) + 0.5 * sum(took) / len(took)) / seconds if took else 0.0
 
     while waiting := [name for name in scenes if share(name) < 1]:
         for name in waiting:
-            began = time.process_time()
             image, took = rendered(scenes[name], spp[name], seed, list(scenes).index(name), len(times[name]) + 1)
-            of_cpu[name].append(time.process_time() - began)
             images[name].append(image)
             times[name].append(took)
             if progress is not None:
                 progress(int(1000 * sum(min(share(n), 1.0) for n in scenes)), 1000 * len(scenes))
-    return {
-        name: TimedRender(np.stack(images[name]), len(t) * spp[name], tuple(t), tuple(of_cpu[name]))
-        for name, t in times.items()
-    }
+    return {name: TimedRender(np.stack(images[name]), len(t) * spp[name], tuple(t)) for name, t in times.items()}

@@ -61,14 +61,12 @@ def _likely(scene: RandomScene, ways: list[Technique], quick: Assessment) -> lis
     noise = {way.name: rows[way.name].variance * rows[way.name].seconds for way in plain}
 
     def may_win(way: Technique) -> bool:
-        if way.name in advised:
-            return True
         if way.light == CORRECTED:
             return corrected_chance(scene.tolerance) > UNLIKELY
         name = replace(way, denoised=False).name
         return not way.denoised or noise.get(name, math.inf) < NOISIER * min(noise.values(), default=math.inf)
 
-    return [way for way in ways if may_win(way)]
+    return [way for way in ways if way.name in advised or may_win(way)]
 
 
 def _once(

@@ -14,7 +14,7 @@ from __future__ import annotations
 import functools
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -22,7 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.geometry.points import EntrySample, ObjectAlbedo, Proposals, SurfacePoint, TransportAround
-from full_geometry.geometry.rounding import EPSILON, OF_WAY, bound_of, bounds, place_bound, ray_to
+from full_geometry.geometry.rounding import EPSILON, OF_WAY, bound_of, bounds, box_ends, place_bound, ray_to
 from full_geometry.geometry.shape import (
     by_pointer,
     completed,
@@ -159,8 +159,7 @@ def _rounding(shape: mi.Shape, to_world: np.ndarray) -> np.ndarray:
 
 def corners(box: mi.ScalarBoundingBox3f, to_world: np.ndarray) -> np.ndarray:
     """The corners of a box under each of the transformations (n, 4, 4), shape (n, 3, 8)."""
-    ends = np.stack([np.ravel(np.array(end, dtype=float)) for end in (box.min, box.max)])
-    points = np.stack(np.meshgrid(*ends.T, indexing="ij")).reshape(3, 8)
+    points = np.stack(np.meshgrid(*box_ends(box).T, indexing="ij")).reshape(3, 8)
     return to_world[:, :3, :3] @ points + to_world[:, :3, 3:]
 
 
@@ -234,7 +233,7 @@ class InstanceTransform(NamedTuple):
         return si
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class InstanceScene:
     """Intersects rays with a scene, or a scene of some of its shapes, whose instances are data of kernels.
 
@@ -258,10 +257,9 @@ class InstanceScene:
     @classmethod
     def of(cls, scene: mi.Scene, shown: Sequence[Group]) -> InstanceScene:
         """Make the tables of a scene whose instances show these groups."""
-        known, lamps = bounds_of(scene.shapes(), shown), lamps_of(scene)
-        if not shown:
-            return cls([], {}, known, lamps)
-        return replace(cls.of_shapes(shapes_of(scene, shown), shown), bounds=known, lamps=lamps)
+        result = cls.of_shapes(shapes_of(scene, shown), shown) if shown else cls([], {})
+        result.measure(scene, shown)
+        return result
 
     @classmethod
     def of_shapes(cls, shapes: list[mi.Shape], shown: Sequence[Group] = ()) -> InstanceScene:
@@ -280,10 +278,9 @@ class InstanceScene:
         dr.make_opaque(tables)
         return cls(shapes, tables, bounds_of([*shapes, *(i for group in shown for i in group.instances)], shown))
 
-    def measure(self, scene: mi.Scene) -> None:
-        """Take the bounds of a scene without instances anew, once shapes have moved: objects that have not are kept."""
-        object.__setattr__(self, "bounds", bounds_of(scene.shapes()))
-        object.__setattr__(self, "lamps", lamps_of(scene))
+    def measure(self, scene: mi.Scene, shown: Sequence[Group] = ()) -> None:
+        """Take the bounds of a scene whose instances show these groups; anew once shapes have moved."""
+        self.bounds, self.lamps = bounds_of(scene.shapes(), shown), lamps_of(scene)
 
     def rounding(self, si: mi.SurfaceInteraction3f) -> mi.Float:
         """A bound of how far from the surface that a ray has met rounding has put `si.p`."""

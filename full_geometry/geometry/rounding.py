@@ -29,11 +29,15 @@ def bounds(shape: mi.Shape, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     return EPSILON * ((OF_SIZE if exact else OF_SIZE_BY_RAY) * h + OF_PLACE * c)
 
 
+def box_ends(box: mi.ScalarBoundingBox3f) -> np.ndarray:
+    """The least and the largest coordinates of a box, shape (2, 3), double precision."""
+    return np.array([np.ravel(np.array(end, dtype=float)) for end in (box.min, box.max)])
+
+
 def bound_of(shape: mi.Shape) -> float:
     """e of a shape where it is; 0 of one without a bounding box."""
     box = shape.bbox()
-    ends = (np.ravel(np.array(end, dtype=float)) for end in (box.min, box.max))
-    return float(bounds(shape, *ends)) if box.valid() else 0.0
+    return float(bounds(shape, *box_ends(box))) if box.valid() else 0.0
 
 
 def place_bound(p: mi.Point3f) -> mi.Float:

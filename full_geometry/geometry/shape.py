@@ -15,7 +15,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from full_geometry.geometry import mesh
-from full_geometry.geometry.rounding import bound_of, ray_from
+from full_geometry.geometry.rounding import bound_of, box_ends, ray_from
 from full_geometry.geometry.snapshot import Snapshot
 from halfspace_sss.arrays import aligned
 
@@ -297,8 +297,7 @@ def analyse_shape(shape: mi.Shape, world: mi.Scene | None = None, groups: Iterab
     if shape.class_name() == "Sphere":  # rays would meet a ball that is shaded as another shape
         check_stretch(f"object {name_of(shape)}", mi.traverse(shape)["to_world"], any_size=True)
     scene = scene_of([shape], world)
-    box = scene.bbox()
-    low, high = np.array(box.min, dtype=float), np.array(box.max, dtype=float)
+    low, high = box_ends(scene.bbox())
     size = float(np.linalg.norm(high - low))
     faces = faces_of(shape, name_of(shape))
     if faces is not None:
@@ -464,11 +463,11 @@ FEW, MANY = 3, 65  # rays from a point, which decide where they agree, and where
 
 def is_inside(geometry: Geometry, points: np.ndarray) -> np.ndarray:
     """Which points (array of shape (3, n)) lie inside a closed object, by the parity of the hits of rays from them."""
-    points, box = np.asarray(points, dtype=float), geometry.scene.bbox()
+    points = np.asarray(points, dtype=float)
     result = np.zeros(points.shape[1], dtype=bool)
     if not geometry.closed:
         return result
-    low, high = (np.reshape(np.array(end, dtype=float), (3, 1)) for end in (box.min, box.max))
+    low, high = box_ends(geometry.scene.bbox())[..., None]
     near = np.flatnonzero(((points >= low) & (points <= high)).all(axis=0))
     share = _odd_share(geometry, points[:, near], FEW)
     result[near] = share > 0.5
@@ -575,8 +574,7 @@ def ray_of_arrays(o: np.ndarray, d: np.ndarray) -> mi.Ray3f:
 
 def rays_into(box: mi.ScalarBoundingBox3f, n: int) -> mi.Ray3f:
     """Rays from about a bounding box to places in it."""
-    ends = (np.array(end, dtype=float).reshape(1, 3) for end in (box.min, box.max))
-    (start,), (along,) = ways_into(*ends, n)
+    (start,), (along,) = ways_into(*box_ends(box)[:, None], n)
     return ray_of_arrays(start, along)
 
 
@@ -594,7 +592,7 @@ def ways_into(low: np.ndarray, high: np.ndarray, n: int) -> tuple[np.ndarray, np
 
 def lines_through(box: mi.ScalarBoundingBox3f, n: int) -> mi.Ray3f:
     """Rays along lines through the ball about a bounding box that are uniform over places and directions."""
-    rng, (low, high) = np.random.default_rng(7), (np.array(end, dtype=float) for end in (box.min, box.max))
+    rng, (low, high) = np.random.default_rng(7), box_ends(box)
     d, aside = rng.standard_normal((2, 3, n))
     d /= np.linalg.norm(d, axis=0)
     aside -= (aside * d).sum(axis=0) * d

@@ -20,7 +20,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.geometry.rounding import before, blocked, bound_of
+from full_geometry.geometry.rounding import before, blocked, bound_of, box_ends
 from full_geometry.geometry.shape import by_pointer, check_stretch, looked_up, pointer_numbers
 from full_geometry.objects.inclusions import check_lamps
 from full_geometry.surface.wrapped import surface_of
@@ -305,10 +305,11 @@ def _warn_of_rounding(scene: mi.Scene, emitter: mi.Emitter) -> None:
     ball = emitter.get_shape()
     if ball is None or ball.class_name() != "Sphere":
         return
-    centre, half = (np.ravel(np.array(v, dtype=float)) for v in (ball.bbox().center(), 0.5 * ball.bbox().extents()))
+    low, high = box_ends(ball.bbox())
+    centre, radius = 0.5 * (low + high), 0.5 * (high - low).max()
     for shape in filter(surface_of, scene.shapes()):
-        low, high = (np.ravel(np.array(v, dtype=float)) for v in (shape.bbox().min, shape.bbox().max))
-        angle = float(half.max() / np.linalg.norm(np.maximum(np.abs(low - centre), np.abs(high - centre))))
+        farthest = np.linalg.norm(np.abs(box_ends(shape.bbox()) - centre).max(axis=0))
+        angle = float(radius / farthest)
         if angle < LEAST_BALL:
             told = "its light is lost" if angle < DARK_BALL else "its light is up to 7 % off"
             warnings.warn(

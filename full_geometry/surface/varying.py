@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.geometry.rounding import box_ends
 from full_geometry.geometry.shape import Geometry, crossings
 from halfspace_sss.physics.medium import Medium
 
@@ -185,5 +186,5 @@ def warn_of_means(spec: Any, obj: Geometry) -> None:
 
 def _points(box: mi.ScalarBoundingBox3f) -> mi.Point3f:
     u = np.random.default_rng(5).random((3, POINTS))
-    low, high = (np.array(v, dtype=float)[:, None] for v in (box.min, box.max))
+    low, high = box_ends(box)[..., None]
     return mi.Point3f(low + u * (high - low))

@@ -10,6 +10,7 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.geometry.rounding import box_ends
 from full_geometry.geometry.sensors import seeded
 from full_geometry.learning.learners import learners
 from full_geometry.scenes.scene_files import first_cause
@@ -200,8 +201,8 @@ class SceneSamples:
 
 
 def _mfp(on: Stage, k: int) -> tuple[float, float]:
-    box = on.shapes[k].bbox()
-    size = float(np.linalg.norm(np.array(box.max, dtype=float) - np.array(box.min, dtype=float))) * on.mm_per_unit
+    low, high = box_ends(on.shapes[k].bbox())
+    size = float(np.linalg.norm(high - low)) * on.mm_per_unit
     thickness = [size * float(m.sigma_t) for m in surface_of(on.shapes[k]).spec.channels()]
     return min(thickness), max(thickness)
 
