@@ -322,8 +322,9 @@ def walk_integrator_class() -> type:
             return LAYER if self.layers else []
 
         def to_string(self) -> str:
-            blur = f", blur = {self.blur:g}" if self.blur != 1 else ""
-            return f"TranslucentWalk[mm_per_unit = {self.mm_per_unit:g}, max_depth = {self.max_depth}{blur}]"
+            # all of them: renders are known by these words
+            shown = {name: self.hidden if name == "hide_emitters" else getattr(self, name) for name in PARAMETERS}
+            return f"TranslucentWalk[{', '.join(f'{name} = {value!r}' for name, value in shown.items())}]"
 
     return TranslucentWalk
 

@@ -115,6 +115,23 @@ def test_what_changes_the_image_changes_the_identity(old: str, new: str, tmp_pat
     assert _hash(XML.replace(old, new), tmp_path) != _hash(XML, tmp_path)
 
 
+@pytest.mark.parametrize(
+    "parameter",
+    [
+        '<boolean name="hide_emitters" value="true"/>',
+        '<integer name="rr_depth" value="4"/>',
+        '<float name="connection_share" value="0.4"/>',
+        '<string name="light" value="sampled"/>',
+        '<boolean name="layers" value="true"/>',
+    ],
+)
+def test_every_parameter_of_walks_is_part_of_the_identity(parameter: str, tmp_path: Path) -> None:
+    plain, walk = '<integrator type="bssrdf"/>', '<integrator type="translucent_walk">{}</integrator>'
+    assert _hash(XML.replace(plain, walk.format(parameter)), tmp_path) != _hash(
+        XML.replace(plain, walk.format("")), tmp_path
+    )
+
+
 def test_media_that_differ_in_the_last_digits_are_different_scenes() -> None:
     def scene(sigma_s: float) -> str:
         bsdf = {"type": "translucent", "sigma_s": sigma_s, "sigma_a": 0.1, "model": "better_dipole"}
