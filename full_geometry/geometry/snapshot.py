@@ -129,10 +129,79 @@ def object_digest(node: mi.Object) -> str:
     """SHA-256 of an object of Mitsuba, in words and by all its parameters."""
     flipped = isinstance(node, mi.Shape) and mesh.is_flipped(node)  # of which Mitsuba tells nothing in words
     digest = hashlib.sha256(f"{words(node)}{flipped}".encode())
-    for key, content in sorted((_MADE_UP.sub("", key), _content(value)) for key, value in mi.traverse(node).items()):
-        digest.update(b"\0%s\0%d\0" % (key.encode(), len(content)))
+    parameters = mi.traverse(node)
+    for name, key in sorted((_MADE_UP.sub("", key), key) for key in parameters.keys()):
+        content = _content(parameters[key])
+        if key.endswith("data"):
+            content += looked_up(parameters.properties[key][2]).encode()
+        digest.update(b"\0%s\0%d\0" % (name.encode(), len(content)))
         digest.update(content)
+    for part in parameters.hierarchy:
+        for volume in getattr(part, "volumes", ()):  # of `translucent`
+            digest.update(object_digest(volume).encode())
     return digest.hexdigest()
+
+
+# Mitsuba says nowhere how texels are filtered and go on beyond the edges of a bitmap; values at places tell it, in
+# words, for the last bits of values differ between processors.
+PLACES, R_3 = 2**12, np.array([[0.8191725], [0.6710436], [0.5497004]])
+STEP, JUMP, SAME = 1 / 8, 0.4, 1e-2  # texels; shares of the largest difference
+
+
+def looked_up(node: mi.Object) -> str:
+    """How a bitmap or a grid shows its values, where that differs from Mitsuba's defaults and can be seen, else ''."""
+    kind, x = node.class_name().partition("Impl")[0], np.arange(1, PLACES + 1) * R_3 % 1
+    if kind == "BitmapTexture":
+        x, size = 3 * x[:2] - 1, np.array(node.resolution(), dtype=float).ravel()
+        show = _bitmap_at(node)
+    elif kind == "GridVolume":
+        size, box = np.array(node.resolution(), dtype=float).ravel(), node.bbox()
+        show = _grid_in(node, *(np.array(corner, dtype=float).reshape(3, 1) for corner in (box.min, box.max)))
+    else:
+        return ""
+    value, result = show(x), []
+
+    # values that jump within a small part of a texel are those of the nearest one
+    far, near = (np.abs(show(x + step / size[:, None]) - value).max() for step in (1, STEP))
+    if near > JUMP * far:
+        result.append("nearest")
+    if kind == "BitmapTexture":
+        ways = {"repeat": x % 1, "clamp": x.clip(0, 1), "mirror": 1 - np.abs(x % 2 - 1)}
+        apart = {way: np.abs(show(y) - value).mean() for way, y in ways.items()}
+        if apart["repeat"] > SAME * np.ptp(value):
+            result.append(min(apart, key=apart.get))
+    return " ".join(result)
+
+
+def _bitmap_at(bitmap: mi.Texture) -> Callable[[np.ndarray], np.ndarray]:
+    """Its values by places (2, n) among the texels, 0 to 1 within the edges."""
+    inverse = np.linalg.pinv(np.array(plain(mi.traverse(bitmap)["to_uv"]), dtype=float).reshape(3, 3))
+
+    def show(x: np.ndarray) -> np.ndarray:
+        si = _interaction(mi.SurfaceInteraction3f, "uv", inverse[:2, :2] @ x + inverse[:2, 2:])
+        if mi.is_spectral:
+            si.wavelengths += 550.0
+        try:
+            return _numbers_of(bitmap.eval_1(si))
+        except RuntimeError:  # colours that have become spectra
+            return _numbers_of(bitmap.eval(si)[0])
+
+    return show
+
+
+def _grid_in(grid: mi.Volume, low: np.ndarray, high: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """Its values by places (3, n) in a box, 0 to 1."""
+    return lambda x: _numbers_of(grid.eval_n(_interaction(mi.Interaction3f, "p", low + x * (high - low)))[0])
+
+
+def _interaction(kind: type, name: str, x: np.ndarray) -> mi.Interaction3f:
+    result = dr.zeros(kind, x.shape[1])
+    setattr(result, name, (mi.Point2f, mi.Point3f)[len(x) - 2](*x.astype(np.float32)))
+    return result
+
+
+def _numbers_of(values: mi.Float) -> np.ndarray:
+    return np.array(dr.detach(values), dtype=float) + np.zeros(PLACES)
 
 
 def words(result: object) -> str:

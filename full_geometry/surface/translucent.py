@@ -320,6 +320,13 @@ def translucent_class() -> type:
                 callback.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
             callback.put("boundary", self.boundary, mi.ParamFlags.Differentiable)
 
+        @property
+        def volumes(self) -> list[mi.Volume]:
+            """The grids of its medium, which no traversal shows."""
+            varying = self.spec.varying
+            found = () if varying is None or varying.by_depth else (varying.density, varying.albedo_volume)
+            return [volume for volume in found if volume is not None]
+
         def parameters_changed(self, keys: Sequence[str] = ()) -> None:
             # the integrators see another `spec`, and make anew what they made of it
             repainted = self.spec.textured is not None and not (keys and all(k.startswith("boundary") for k in keys))

@@ -148,6 +148,36 @@ def test_another_attribute_of_a_mesh_is_another_scene() -> None:
     assert digest("vertex_color") != digest("vertex_albedo")
 
 
+@pytest.mark.parametrize("option", ["filter_type=nearest", "wrap_mode=clamp", "wrap_mode=mirror"])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_another_filter_or_edge_of_a_texture_is_another_scene(option: str, channels: int) -> None:
+    texels = np.random.default_rng(3).uniform(0.2, 0.8, (5, 7, channels)).astype(np.float32)
+    turned = mi.ScalarTransform4f().rotate([0, 0, 1], 30).scale([2, 3, 1])
+
+    def digest(**more: str) -> str:
+        plain = {"type": "bitmap", "bitmap": mi.Bitmap(texels), "to_uv": turned, **more}
+        return object_digest(mi.load_dict({"type": "diffuse", "reflectance": plain}))
+
+    name, value = option.split("=")
+    assert digest() == digest(filter_type="bilinear", wrap_mode="repeat") != digest(**{name: value})
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_mirrored_voxels_and_another_filter_of_a_grid_are_another_medium(channels: int) -> None:
+    voxels = np.random.default_rng(4).uniform(1, 9, (4, 5, 6, channels)).astype(np.float32)
+    place = mi.ScalarTransform4f().translate([100, 0, 3]).rotate([0, 0.6, 0.8], 30).scale(4)
+
+    def digest(step: int = 1, name: str = "trilinear") -> str:
+        values = mi.VolumeGrid(np.ascontiguousarray(voxels[::step]))
+        grid = {"type": "gridvolume", "grid": values, "raw": True, "filter_type": name, "to_world": place}
+        bsdf = {"type": "translucent", "sigma_t": grid, "albedo": 0.9}
+        found = mi.load_dict({"type": "scene", "ball": {"type": "sphere", "bsdf": bsdf}})
+        return scene_hash(found, mi.load_dict({"type": "translucent_walk"}))
+
+    assert digest() == digest()
+    assert len({digest(), digest(step=-1), digest(name="nearest")}) == 3
+
+
 def test_objects_that_swap_their_surfaces_are_another_scene() -> None:
     def scene(a: float, b: float) -> str:
         balls = {
