@@ -31,6 +31,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter
 
 from full_geometry.geometry.sensors import seeded
+from full_geometry.geometry.snapshot import scene_hash
 from full_geometry.inverse.views import GivenView, edit
 from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.noise_free import NoiseFree
@@ -449,10 +450,11 @@ class ViewComparison:
         self.factors[which] = np.clip(factor, 1 / EXPOSURE, EXPOSURE)
 
     def fingerprint(self, *start: object) -> str:
-        """A hash of the images, the settings, the start of a fit, and versions."""
+        """A hash of the scene, the images, the settings, the start of a fit, and versions."""
         views = [(v.sensor if isinstance(v.sensor, int) else str(v.sensor), v.held_out, v.edits) for v in self.views]
         told = provenance()
-        of = [asdict(self.settings), start, views, told["versions"], told["commit"]]
+        scene = scene_hash(self.scene, self.scene.integrator())
+        of = [scene, asdict(self.settings), start, views, told["versions"], told["commit"]]
         digest = hashlib.sha256(json.dumps(of).encode())
         for view in self.views:
             digest.update(view.image.tobytes() + view.counts.tobytes())

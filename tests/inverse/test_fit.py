@@ -256,6 +256,17 @@ def test_all_steps_of_a_fit_run_the_same_kernels(tmp_path: Path) -> None:
     assert kernels[2] and kernels[2] <= kernels[1]
 
 
+def test_a_fit_does_not_go_on_in_another_light(tmp_path: Path) -> None:
+    scene, view = tmp_path / "a.xml", GivenView.of("a", 0, np.full((8, 8, 3), 0.4, np.float32))
+    how = {"settings": inverse.FitSettings(steps=1, spp=4), "work": tmp_path / "work"}
+    scene.write_text(XML)
+    first, again = (inverse.fit(scene, [view], ("albedo",), **how) for _ in range(2))
+    assert (first.values["albedo"] == again.values["albedo"]).all()
+    scene.write_text(XML.replace('name="radiance" value="0.3"', 'name="radiance" value="0.6"'))
+    with pytest.raises(ValueError, match="work must be a new folder or come from the same fit"):
+        inverse.fit(scene, [view], ("albedo",), **how)
+
+
 @pytest.mark.slow
 def test_a_killed_fit_goes_on_with_the_same_bits_and_the_command_writes_a_scene(tmp_path: Path) -> None:
     scene = _scene(tmp_path)
