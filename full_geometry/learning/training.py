@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import time
 import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,7 +36,7 @@ from full_geometry.transport.exit_pairs import EntryProposals, Pairs, PairSource
 from full_geometry.transport.features import n_local, n_pair, n_side
 from full_geometry.transport.one_object import BASE_MODEL, FullGeometry, HalfSpace
 from full_geometry.transport.patches import Patches, PatchSampler, cluster
-from full_geometry.transport.storing import frame_of, identify
+from full_geometry.transport.storing import Identity, frame_of, identify
 from halfspace_sss.arrays import aligned
 from halfspace_sss.backend import clock
 from halfspace_sss.checks import check_count, check_interval
@@ -167,7 +168,7 @@ class CameraExits:
 VALIDATIONS = 4  # in a run
 EXITS, WALKS, SAMPLES = 256, 2048, 512  # of a validation
 CHECKPOINT_EVERY = 15.0  # seconds
-PLAN = "plan.json"
+PLAN, PLACES = "plan.json", "places.npz"
 LOOP_SHARE = 0.83  # of the seconds for data and steps, the rest for pilot, solving and errors
 
 
@@ -289,6 +290,23 @@ def train_unattended(
     return _ObjectTraining(obj, recipe, seed, None, None).unattended(folder, cpu_seconds, chunks)
 
 
+def _claim_places(work: Path, identity: Identity) -> None:
+    """Write where the points of an object and of what lies in it are, or check that it has only been moved since.
+    ValueError if it is another one."""
+    path = work / PLACES
+    if not path.exists():
+        file = io.BytesIO()
+        np.savez(file, anchors=identity.anchors, probes=identity.probes)
+        write_atomically(path, file.getvalue())
+        return
+    with np.load(path, allow_pickle=False) as before:
+        known = replace(identity, anchors=before["anchors"], probes=before["probes"])
+    try:
+        known.pose(identity)
+    except ValueError as error:
+        raise ValueError(f"{work}: work must come from the same object, name another folder: {error}") from error
+
+
 class _ObjectTraining:
     def __init__(
         self,
@@ -390,6 +408,7 @@ class _ObjectTraining:
             run["camera"] = {"scene": self.camera.about.get("scene"), "schedule": self.seen.schedule}
         if self.work:
             claim(self.work, **run)
+            _claim_places(self.work, self.identity)
             if (self.work / PLAN).exists():
                 chunks = int(json.loads((self.work / PLAN).read_text(encoding="utf-8"))["chunks"])
             if (self.work / CHECKPOINT).exists():

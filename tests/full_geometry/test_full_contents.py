@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from benchmarks.mitsuba_media import medium, with_media  # noqa: E402
 from full_geometry.geometry.points import ObjectModel, SurfacePoint, refract_in  # noqa: E402
 from full_geometry.geometry.sensors import camera_rays  # noqa: E402
 from full_geometry.integrators.walk_paths import FirstExits  # noqa: E402
+from full_geometry.learning import training  # noqa: E402
 from full_geometry.learning.learners import ObjectLearner  # noqa: E402
 from full_geometry.learning.model_errors import EVEN_SKY, errors_of  # noqa: E402
 from full_geometry.learning.network_fitting import Recipe  # noqa: E402
@@ -184,6 +186,24 @@ def test_weights_belong_to_what_lies_inside_at_its_place() -> None:
             trained.pose(other)
         assert (trained.digest() == other.digest()) <= moved, name
     assert len({weights_name(each) for each in (trained, *others.values())}) == 1 + len(EDITS)
+
+
+@pytest.mark.slow
+def test_work_of_a_training_is_not_gone_on_with_after_a_thing_inside_has_moved(monkeypatch, tmp_path: Path) -> None:
+    def stop(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(training._ObjectTraining, "_plan", stop)
+    small = Recipe(width=8, depth=1, batch=64, chunk=2**9, reuse=1)
+
+    def train(inside: dict) -> None:
+        with pytest.raises(KeyboardInterrupt):
+            full_geometry.train(mi.load_dict(scene(inside)), chunks=2, recipe=small, folder=tmp_path, work=tmp_path)
+
+    train(INSIDE["stone"]())
+    train(INSIDE["stone"]())
+    with pytest.raises(ValueError, match="work must come from the same object.*moved and turned only"):
+        train(EDITS["a little off"]())
 
 
 def test_things_inside_are_known_in_any_order_and_under_any_name() -> None:
