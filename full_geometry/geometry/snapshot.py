@@ -105,7 +105,7 @@ def scene_hash(scene: mi.Scene, integrator: mi.Integrator) -> str:
     For the weights of models see `scenes.reference.learnt`."""
     own = scene.integrator()
     result = sorted(object_digest(child) for child in children(scene) if child is not own)
-    return hashlib.sha256("\n".join([*result, words(integrator)]).encode()).hexdigest()
+    return hashlib.sha256("\n".join([*result, integrator_words(integrator)]).encode()).hexdigest()
 
 
 def held(holder: mi.Object) -> list[tuple[str, object]]:
@@ -208,6 +208,15 @@ def words(result: object) -> str:
     """The text of an object by `str`, with all digits where Python prints it."""
     with np.printoptions(precision=17, threshold=sys.maxsize):
         return _LEFT_OUT.sub("", _MADE_UP.sub("", str(result)))
+
+
+def integrator_words(integrator: mi.Integrator) -> str:
+    """The text of an integrator, with the emitters that it or those inside it hide, which Mitsuba's leave out."""
+    hidden = [
+        words(each) for each in (integrator, *children(integrator))
+        if getattr(each, "hide_emitters", False) and "hide_emitters" not in words(each)
+    ]  # fmt: skip
+    return "\n".join([words(integrator), *(f"hide_emitters: {each}" for each in hidden)])
 
 
 def _content(value: object) -> bytes:

@@ -41,7 +41,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from full_geometry.geometry.sensors import sampled_size, seeded
-from full_geometry.geometry.snapshot import children, scene_hash, words
+from full_geometry.geometry.snapshot import children, integrator_words, scene_hash
 from full_geometry.integrators.bssrdf import is_bssrdf
 from full_geometry.objects.objects import translucent_shapes
 from full_geometry.scenes.reference_store import (
@@ -415,7 +415,7 @@ def about_render(scene: mi.Scene, integrator: mi.Integrator, sensor: int, seed: 
     """The identity of a render, with its provenance."""
     about = {
         "scene": scene_hash(scene, integrator),
-        "integrator": words(integrator),
+        "integrator": integrator_words(integrator),
         "sensor": sensor,
         "seed": int(seed),
         "variant": mi.variant(),

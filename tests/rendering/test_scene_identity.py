@@ -132,6 +132,21 @@ def test_every_parameter_of_walks_is_part_of_the_identity(parameter: str, tmp_pa
     )
 
 
+@pytest.mark.parametrize("kind", ["path", "volpathmis", "direct"])
+@pytest.mark.parametrize(
+    "around",
+    ["{}", '<integrator type="aov"><string name="aovs" value="d:depth"/>{}</integrator>'],
+    ids=["alone", "in aov"],
+)
+def test_integrators_of_mitsuba_that_hide_emitters_make_other_renders(kind: str, around: str, tmp_path: Path) -> None:
+    shown, hidden = (
+        around.format(f'<integrator type="{kind}"><boolean name="hide_emitters" value="{value}"/></integrator>')
+        for value in ("false", "true")
+    )
+    plain = '<integrator type="bssrdf"/>'
+    assert _hash(XML.replace(plain, shown), tmp_path) != _hash(XML.replace(plain, hidden), tmp_path)
+
+
 def test_media_that_differ_in_the_last_digits_are_different_scenes() -> None:
     def scene(sigma_s: float) -> str:
         bsdf = {"type": "translucent", "sigma_s": sigma_s, "sigma_a": 0.1, "model": "better_dipole"}
@@ -194,7 +209,9 @@ def test_objects_that_swap_their_surfaces_are_another_scene() -> None:
 
 
 @pytest.mark.parametrize(
-    "holder", ["{}", '<integrator type="aov"><string name="aovs" value="d:depth"/>{}</integrator>']
+    "holder",
+    ["{}", '<integrator type="aov"><string name="aovs" value="d:depth"/>{}</integrator>'],
+    ids=["alone", "in aov"],
 )
 def test_weights_that_a_model_was_trained_to_are_part_of_what_a_render_is_known_by(
     holder, tmp_path, monkeypatch
