@@ -30,7 +30,7 @@ UNLIKELY = 0.1  # chance to keep the tolerance, below which corrected light has 
 NOISIER = 2.0  # times the noise of plain walks in the same time, beyond which they are not denoised in a long run
 PLAIN = 0.25  # of the seconds of a long run, beside its denoised walks
 KNOWN = 0.05  # relative standard error of the squared error of denoised walks, which ends it
-FORMAT = "halfspace-sss trade check 9"
+FORMAT = "halfspace-sss trade check 10"
 
 
 def check_scene(scene: RandomScene, folder: Path, seconds: float, truth_seconds: float) -> dict[str, object]:

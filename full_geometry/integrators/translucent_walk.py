@@ -67,6 +67,11 @@ WIDEST = 20.0  # blur: 1 and 3 radians
 Keep = Callable[[FirstExits], None]
 
 
+def precomputes_light(integrator: mi.Integrator | None, scene: mi.Scene) -> bool:
+    """Whether an integrator is `translucent_walk`, and precomputes light for images of a scene."""
+    return isinstance(integrator, walk_integrator_class()) and integrator.precomputes(scene, integrator.media(scene))
+
+
 @per_variant
 def walk_integrator_class() -> type:
     """The class of the integrator for the current variant of Mitsuba."""

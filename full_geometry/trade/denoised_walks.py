@@ -38,7 +38,7 @@ from full_geometry.trade.images import film_of, pixel_means, pixels_of
 from full_geometry.trade.results import DOUBT, TechniqueTrade
 from full_geometry.trade.sampling import seen_through
 from full_geometry.trade.statistics import Number
-from full_geometry.trade.techniques import Effort, Stage, Technique
+from full_geometry.trade.techniques import PRECOMPUTED, Effort, Stage, Technique
 from halfspace_sss.backend import clock
 
 SIDE, MARGIN = 24, 4  # of a tile, pixels; beside the margin errors of a whole image are the same
@@ -93,7 +93,7 @@ def denoised_rows(
     tolerance."""
     # ---- tiles of the image, as many as leave each the samples that are wanted
     started = clock()
-    camera, seed = on.scene.sensors()[effort.sensor], effort.seed
+    camera, seed, quick = on.scene.sensors()[effort.sensor], effort.seed, technique.light == PRECOMPUTED
     film = tuple(int(n) for n in camera.film().crop_size())
     seen, halves = [k for k, each in enumerate(found) if each], (technique.halves[0], technique.halves[-1])
     of_tile = 2 * SIDE**2 * max(found[k].pace for k in seen)
@@ -116,7 +116,7 @@ def denoised_rows(
             passes = _passes(on, part, camera, film, tiles.pixels, limits, (PASSES, more, number))
             tiles.take(half, passes, spp, more)
         spp, each = spp + more, (clock() - began) / more
-        tiles.denoise(spp)
+        tiles.denoise(spp, quick)
         laws = {k: _law(tiles, k, found[k]) for k in seen}
         ends = [laws[k].end(found[k].row, tolerance, PASSES * spp) for k in seen]
         alone = [laws[k].denoised(n) for k, n in zip(seen, ends)]
@@ -125,8 +125,9 @@ def denoised_rows(
 
     # ---- the law of each object about the samples that keep the tolerance
     black = np.zeros((TIMED, TIMED, 3), dtype=np.float32)
-    # two halves are denoised, two guides lose their noise, and these take as long as one of them
-    of_image = 5 * denoised(black, black, black, clean=True)[1] / black[..., 0].size * math.prod(film) / len(seen)
+    of_half, of_guide = (denoised(black, black, black, clean=True, quick=each)[1] for each in (quick, True))
+    # two halves are denoised, two guides lose their noise, and to render these takes as long as one of them
+    of_image = (2 * of_half + 3 * of_guide) / black[..., 0].size * math.prod(film) / len(seen)
     rows: list[TechniqueTrade | None] = [None] * len(found)
     for k, n in zip(seen, ends):
         plain, e = found[k].row, laws[k].at(n)
@@ -190,11 +191,12 @@ class Tiles:
         passes = passes.reshape(PASSES, *self.shape, 3)
         self.halves[half] = (before * self.halves[half] + spp * passes) / (before + spp)
 
-    def denoise(self, spp: int) -> None:
-        """Denoise the first passes of each half, which have so many samples, all tiles side by side."""
+    def denoise(self, spp: int, quick: bool) -> None:
+        """Denoise the first passes of each half, which have so many samples, all tiles side by side; `quick`: see
+        `denoised`."""
         for n in LEVELS:
             images = [_side_by_side(half[:n].mean(axis=0)) for half in self.halves]
-            clean = [denoised(x, *self.guides, clean=True)[0] for x in images]
+            clean = [denoised(x, *self.guides, clean=True, quick=quick)[0] for x in images]
             self.parts.append((n * spp, [_apart(x, self.shape) for x in clean]))
 
     def squares(self, k: int) -> tuple[np.ndarray, np.ndarray]:

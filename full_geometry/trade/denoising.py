@@ -72,7 +72,7 @@ def clean_guides(found: tuple[np.ndarray, np.ndarray]) -> list[np.ndarray]:
 
 
 def denoised(
-    image: np.ndarray, albedo: np.ndarray, normal: np.ndarray, clean: bool = False
+    image: np.ndarray, albedo: np.ndarray, normal: np.ndarray, clean: bool = False, quick: bool = False
 ) -> tuple[np.ndarray, float]:
     """The image without its noise, float32, and the seconds it took.
 
@@ -80,6 +80,8 @@ def denoised(
         image: linear radiance (H, W, 3).
         albedo, normal: as `guides` makes them.
         clean: whether these have no noise, so that their detail is kept.
+        quick: whether the network for clean guides is the smaller one, of half the time. It suits precomputed light,
+            where the larger one lowers errors by 0 to 5 %, and keeps noise of sampled walks under even light.
 
     Raises:
         ValueError: the image is not finite or below 0, or the sizes differ.
@@ -90,8 +92,7 @@ def denoised(
         if np.shape(guide) != pixels.shape:
             raise ValueError(f"{name} must have the shape of the image {pixels.shape}, got {np.shape(guide)}")
     albedo, normal = (np.ascontiguousarray(guide, dtype=np.float32) for guide in (albedo, normal))
-    # with clean guides the better network takes twice the time, for a tenth less error
-    quality = oidn.Quality.Balanced if clean else oidn.Quality.High
+    quality = oidn.Quality.Balanced if clean and quick else oidn.Quality.High
     started = clock()
     result = oidn.denoise(pixels, albedo=albedo, normal=normal, hdr=True, clean_aux=clean, quality=quality)
     return np.maximum(np.asarray(result), 0.0), clock() - started
@@ -107,13 +108,17 @@ class Denoiser:
         self, scene: mi.Scene, sensor: mi.Sensor | int = 0, integrator: mi.Integrator | None = None,
         spp: int = GUIDE_SPP, clean: bool = True,
     ) -> None:  # fmt: skip
+        from full_geometry.integrators.translucent_walk import precomputes_light
+
         check_denoiser()
+        integrator = integrator or scene.integrator()
         found = guides(scene, sensor, spp)
         self._surface = np.any(found, axis=(0, 3))
         self._box, self._clean = _box_around(self._surface), clean
         boxed = tuple(guide[self._box] for guide in found)
         self._guides = clean_guides(boxed) if clean else boxed
-        self._layered = bool(getattr(integrator or scene.integrator(), "layers", False))
+        self._layered = bool(getattr(integrator, "layers", False))
+        self._quick = precomputes_light(integrator, scene)
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """The colours (H, W, 3) without noise; a layer of emission stays as it is: edges of lamps in mirrors are sharp.
@@ -124,7 +129,7 @@ class Denoiser:
         light = np.maximum(image[..., :3] if image.shape[2] >= 3 else image[..., :1].repeat(3, axis=2), 0.0)
         emission = np.clip(image[..., -3:], 0.0, light) if self._layered and image.shape[2] > 3 else 0.0
         rest = (light - emission).astype(np.float32)
-        found = denoised(rest[self._box], *self._guides, clean=self._clean)[0]
+        found = denoised(rest[self._box], *self._guides, clean=self._clean, quick=self._quick)[0]
         rest[self._box] = np.where(self._surface[self._box][..., None], found, rest[self._box])
         return rest + emission
 
