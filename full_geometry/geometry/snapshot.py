@@ -17,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.geometry import mesh
+from full_geometry.geometry.rounding import box_ends
 
 
 class Snapshot:
@@ -133,7 +134,7 @@ def object_digest(node: mi.Object) -> str:
     for name, key in sorted((_MADE_UP.sub("", key), key) for key in parameters.keys()):
         content = _content(parameters[key])
         if key.endswith("data"):
-            content += looked_up(parameters.properties[key][2]).encode()
+            content += filtering(parameters.properties[key][2]).encode()
         digest.update(b"\0%s\0%d\0" % (name.encode(), len(content)))
         digest.update(content)
     for part in parameters.hierarchy:
@@ -144,21 +145,20 @@ def object_digest(node: mi.Object) -> str:
 
 # Mitsuba says nowhere how texels are filtered and go on beyond the edges of a bitmap; values at places tell it, in
 # words, for the last bits of values differ between processors.
-PLACES, R_3 = 2**12, np.array([[0.8191725], [0.6710436], [0.5497004]])
+PLACES = 2**12
 STEP, JUMP, SAME = 1 / 8, 0.4, 1e-2  # texels; shares of the largest difference
 
 
-def looked_up(node: mi.Object) -> str:
+def filtering(node: mi.Object) -> str:
     """How a bitmap or a grid shows its values, where that differs from Mitsuba's defaults and can be seen, else ''."""
-    kind, x = node.class_name().partition("Impl")[0], np.arange(1, PLACES + 1) * R_3 % 1
+    kind, x = node.class_name().partition("Impl")[0], np.random.default_rng(5).random((3, PLACES))
     if kind == "BitmapTexture":
-        x, size = 3 * x[:2] - 1, np.array(node.resolution(), dtype=float).ravel()
-        show = _bitmap_at(node)
+        x, show = 3 * x[:2] - 1, _bitmap_at(node)
     elif kind == "GridVolume":
-        size, box = np.array(node.resolution(), dtype=float).ravel(), node.bbox()
-        show = _grid_in(node, *(np.array(corner, dtype=float).reshape(3, 1) for corner in (box.min, box.max)))
+        show = _grid_in(node, *box_ends(node.bbox())[..., None])
     else:
         return ""
+    size = np.array(node.resolution(), dtype=float).ravel()
     value, result = show(x), []
 
     # values that jump within a small part of a texel are those of the nearest one

@@ -92,7 +92,7 @@ def denoised(
         if np.shape(guide) != pixels.shape:
             raise ValueError(f"{name} must have the shape of the image {pixels.shape}, got {np.shape(guide)}")
     albedo, normal = (np.ascontiguousarray(guide, dtype=np.float32) for guide in (albedo, normal))
-    quality = oidn.Quality.Balanced if clean and quick else oidn.Quality.High
+    quality = oidn.Quality.Balanced if quick else oidn.Quality.High
     started = clock()
     result = oidn.denoise(pixels, albedo=albedo, normal=normal, hdr=True, clean_aux=clean, quality=quality)
     return np.maximum(np.asarray(result), 0.0), clock() - started
@@ -118,7 +118,7 @@ class Denoiser:
         boxed = tuple(guide[self._box] for guide in found)
         self._guides = clean_guides(boxed) if clean else boxed
         self._layered = bool(getattr(integrator, "layers", False))
-        self._quick = precomputes_light(integrator, scene)
+        self._quick = clean and precomputes_light(integrator, scene)
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """The colours (H, W, 3) without noise; a layer of emission stays as it is: edges of lamps in mirrors are sharp.

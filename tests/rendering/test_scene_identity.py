@@ -36,6 +36,11 @@ XML = """<scene version="3.0.0">
   </sensor>
 </scene>
 """
+HOLDERS = pytest.mark.parametrize(
+    "holder",
+    ["{}", '<integrator type="aov"><string name="aovs" value="d:depth"/>{}</integrator>'],
+    ids=["alone", "in aov"],
+)
 TELL = """
 import sys
 import full_geometry
@@ -133,14 +138,10 @@ def test_every_parameter_of_walks_is_part_of_the_identity(parameter: str, tmp_pa
 
 
 @pytest.mark.parametrize("kind", ["path", "volpathmis", "direct"])
-@pytest.mark.parametrize(
-    "around",
-    ["{}", '<integrator type="aov"><string name="aovs" value="d:depth"/>{}</integrator>'],
-    ids=["alone", "in aov"],
-)
-def test_integrators_of_mitsuba_that_hide_emitters_make_other_renders(kind: str, around: str, tmp_path: Path) -> None:
+@HOLDERS
+def test_integrators_of_mitsuba_that_hide_emitters_make_other_renders(kind: str, holder: str, tmp_path: Path) -> None:
     shown, hidden = (
-        around.format(f'<integrator type="{kind}"><boolean name="hide_emitters" value="{value}"/></integrator>')
+        holder.format(f'<integrator type="{kind}"><boolean name="hide_emitters" value="{value}"/></integrator>')
         for value in ("false", "true")
     )
     plain = '<integrator type="bssrdf"/>'
@@ -208,11 +209,7 @@ def test_objects_that_swap_their_surfaces_are_another_scene() -> None:
     assert scene(0.1, 0.2) != scene(0.2, 0.1)
 
 
-@pytest.mark.parametrize(
-    "holder",
-    ["{}", '<integrator type="aov"><string name="aovs" value="d:depth"/>{}</integrator>'],
-    ids=["alone", "in aov"],
-)
+@HOLDERS
 def test_weights_that_a_model_was_trained_to_are_part_of_what_a_render_is_known_by(
     holder, tmp_path, monkeypatch
 ) -> None:
